@@ -10,8 +10,8 @@ from pydantic import Field
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
-from parkenv.files.spec_file import Several, Spec
 from parkenv.files.limited_reading import JsonFormat
+from parkenv.files.spec_file import Several, Spec
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
 

@@ -22,12 +22,10 @@ from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.runner import run
 from parkenv.studies.simulate import Observer
 from parkenv.studies.trips.calibration import calibrate
-from parkenv.studies.trips.calibration_study import CalibrationStudy
+from parkenv.studies.trips.calibration_study import OBSERVED, UNOBSERVED, CalibrationStudy
 from parkenv.studies.trips.driven_car import (
     NO_ROOM,
-    OBSERVED,
     TAKEN,
-    UNOBSERVED,
     DrivingStyle,
     ParkingAttempt,
 )

@@ -21,7 +21,8 @@ from parkenv.scenarios.calibration import Calibration
 from parkenv.show.figures.picture_files import INK, picture
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of, mean_interval
-from parkenv.studies.trips.driven_car import EDGE_KINDS, OBSERVED, UNOBSERVED, Leg, ParkingAttempt
+from parkenv.studies.trips.calibration_study import OBSERVED, UNOBSERVED
+from parkenv.studies.trips.driven_car import EDGE_KINDS, Leg, ParkingAttempt
 from parkenv.studies.trips.driven_search import Trip
 from parkenv.world.scenario import KMH, Scenario
 

@@ -17,7 +17,6 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, Vehicle, require_rig
 from parkenv.studies.results import JsonTable, Results, Row
 from parkenv.studies.study import Cell, Study
-from parkenv.studies.trips.driven_car import OBSERVED, UNOBSERVED
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 CALIBRATED = "calibrated.json"
+OBSERVED, UNOBSERVED = "observed", "unobserved"
+"""Whether the agent observes slots from the lane, in the column `slots` of trips."""
 
 
 class _Trips(NamedTuple):

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
 ALONG, TURN, ROUND, ACROSS = "along", "turn", "round", "across"
-OBSERVED, UNOBSERVED = "observed", "unobserved"
-"""Whether the agent observes slots from the lane, in the column `slots` of trips."""
 EDGE_KINDS = (ALONG, TURN, ROUND, ACROSS)
 """Kinds of edges: straight on; with a turn into another lane; with a U-turn; across a two-way lane, where the car turns
 round only if it drives on afterwards, not if it parks."""
