@@ -21,8 +21,7 @@ def make_small(patch):
         patch.setitem(configs.SEARCH_CONFIGS, name, small)
     patch.setattr(configs, "MIN_UPDATES", 0)
     # An untrained agent drives in circles.
-    for module in ("training", "evaluation"):
-        patch.setattr(f"parkenv.studies.training.{module}.MAX_STEPS", 60)
+    patch.setattr("parkenv.studies.training.training.MAX_STEPS", 60)
 
 
 def search_training(algorithm, steps, every, places, held_out=(), episodes=4, **fields):

@@ -18,7 +18,7 @@ from parkenv.studies.benchmark.page import Entry, precision
 from parkenv.studies.benchmark.result_file import check_result, fingerprint, result_of, write_result
 from parkenv.studies.benchmark.suite import CONTROLS, Stratum, Suite, worlds_of
 from parkenv.studies.lots.census import slots_by_kind
-from parkenv.studies.results import DECISIONS, EPISODES
+from parkenv.studies.results import EPISODES
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival
 
@@ -44,13 +44,6 @@ def episodes_of(cells):
 def result(small):
     cases = small.cases([AgentSpec(name=name) for name in AGENTS])
     return result_of(small, cases, episodes_of(cases), ["parkenv", "benchmark", "run"])
-
-
-def test_a_suite_without_its_timings_is_refused(small):
-    cases = small.cases([AgentSpec(name="first-free")])
-    episodes = {key: row | {DECISIONS: ""} for key, row in episodes_of(cases).items()}
-    with pytest.raises(InputError, match=r"no decision_ms of first-free in .*timings\.csv is not whole"):
-        result_of(small, cases, episodes, ["parkenv", "benchmark", "run"])
 
 
 def checked(content, small, path, monkeypatch):

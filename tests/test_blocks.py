@@ -55,7 +55,7 @@ BLOCKS_OF_RUN = {
 
 def columns(run, table, purpose=ALL):
     """The lines of a table about cars of a purpose, as arrays by column, for each day."""
-    names, days = (*table.line_keys, *table.columns), []
+    names, days = table.columns, []
     for row in run[0].results.rows(table).values():
         lines = {name: np.array(row[name]) for name in names}
         chosen = lines["purpose"] == purpose if "purpose" in names else slice(None)
@@ -115,16 +115,6 @@ def test_detours_of_lanes_are_those_of_cars(run):
         assert cruised_m == pytest.approx(day["cruised_m"] * len(cars), rel=1e-3)
         assert np.nansum(blocks["cruised_m"] * blocks["arrivals"]) == pytest.approx(cruised_m, rel=1e-3)
         assert (lanes["cruised_m"] <= lanes["driven_m"]).all()
-
-
-def test_tables_are_read_as_they_were_written_and_the_last_of_two_equal_lines_counts(run):
-    folder = run[0].folder
-    for table in (BLOCKS, LANES, HOURS):
-        rows = table.read(folder)
-        assert json.dumps(rows) == json.dumps(list(run[0].results.rows(table).values()))
-        table.append(folder, rows[:1], sync=False)
-        assert json.dumps(table.read(folder)) == json.dumps(rows)
-        table.write(folder, rows)
 
 
 def test_zones_are_groups_of_blocks(run):

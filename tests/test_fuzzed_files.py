@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from file_mutations import mutated_bytes, mutated_json, mutated_text
 from made_maps import car_park
-from test_csv_tables import EPISODE, SESSION
 
 from parkenv import InputError, OccupancyLog, OccupancyProcess, SensorModel
 from parkenv.files.images import read_image
@@ -32,13 +31,9 @@ from parkenv.show.report.page import write_page
 from parkenv.studies.benchmark.result_file import check_result
 from parkenv.studies.benchmark.suite import Suite
 from parkenv.studies.compare.comparison import Comparison
-from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.fleet.tables import CHANGES
 from parkenv.studies.report import RunFolder
-from parkenv.studies.results import EPISODES, Results, decision_s
-from parkenv.studies.sensing.sessions import SESSIONS
-from parkenv.studies.sensing.surveys import detection_by_distance
-from parkenv.studies.trips.calibration_study import CalibrationStudy
+from parkenv.studies.results import DECISIONS, EPISODES, Results, decision_s
 
 MINI = packaged_lot("mini")
 ROOT = Path(__file__).parents[1] / "parkenv"
@@ -88,6 +83,15 @@ def scenario(path):
     build(ScenarioSpec.read(path))
 
 
+def stored(path):
+    """The store of a run with two searches."""
+    with Results(path.parent) as results:
+        results.begin({}, continues=False)
+        row = dict.fromkeys((*EPISODES.keys, *EPISODES.columns), 1.5) | {DECISIONS: "12 3"}
+        results.add([row, row | {"seed": 2}])
+    (path.parent / "results.sqlite").rename(path)
+
+
 def resumed(path):
     folder = Results(path.parent)
     folder.claim({"seed": 0, "agents": {}}, resume=True)
@@ -95,13 +99,8 @@ def resumed(path):
         decision_s(row)
 
 
-def resumed_trips(path):
-    CalibrationStudy.table.read(path.parent)
-
-
 def reported(path):
     run = RunFolder.read(path.parent)
-    EPISODES.read(path.parent)
     write_page(run.data(), path.with_name("report.html"), run.figures)
 
 
@@ -109,14 +108,6 @@ def reported_kind(path):
     """Report on a summary whose file is named after its command."""
     shutil.copy(path, path.with_name("summary.json"))
     reported(path.with_name("summary.json"))
-
-
-def days(path):
-    FleetStudy.table.read(path.parent)
-
-
-def sessions(path):
-    detection_by_distance(SESSIONS.read(path.parent))
 
 
 def true_locations(path):
@@ -198,13 +189,6 @@ SUMMARY_ROW = dict.fromkeys(
     "scenario": "mini", "occupancy_level": None, "agent": "mdp", "episodes": 2, "parked_fraction": 1.0,
     "truncated_fraction": 0.0, "gave_up_fraction": 0.0, "leads": True, "total_s": 50.0, "drive_s": 30.0,
 }  # fmt: skip
-EPISODE_ROWS = (
-    "\n".join(",".join(row) for row in (EPISODE, EPISODE.values(), (EPISODE | {"seed": "1"}).values())) + "\n"
-)
-TIMING_ROWS = (
-    "scenario,occupancy_level,agent,failure_cost_s,v_walk_kmh,v_drive_kmh,seed,decisions_us\n"
-    "mini,,mdp,10.0,4.0,10.0,0,12 3 4\nmini,,mdp,10.0,4.0,10.0,1,5 6\n"
-)
 SUMMARY = {
     "command": ["parkenv", "compare", "--episodes", "2"], "version": "0.1.0", "seed": 0,
     "rows": [SUMMARY_ROW, SUMMARY_ROW | {"agent": "random", "total_s": 70.0}],
@@ -241,16 +225,6 @@ FLEET_SUMMARY = {
         }
     ],
 }  # fmt: skip
-DAY = dict.fromkeys((*FleetStudy.table.keys, *FleetStudy.table.columns), "1.5") | {
-    "scenario": "mini", "agents": "random", "knows": "own", "day": "0", "cars": "20", "members_s": "nan",
-}  # fmt: skip
-DAY_ROWS = f"{','.join(DAY)}\n{','.join(DAY.values())}\n"
-SESSION_ROWS = f"{','.join(SESSION)}\n{','.join(SESSION.values())}\n"
-TRIP = dict.fromkeys(("graph_m", "driven_m", "contacts", "strays", "rescues", "waited_s"), 0.0) | {
-    "slots": "observed", "seed": 0, "agent": "mdp", "total_s": 25.0, "lanes_s": 5.0, "manoeuvre_s": 10.0,
-    "costs": {"failed_s": 0.0, "walk_s": 10.0, "parking_cost_s": 0.0, "gave_up_s": 0.0}, "parked": True, "slot": "A1",
-    "slot_kind": "perpendicular", "legs": [], "attempts": [],
-}  # fmt: skip
 _PIXELS = np.random.default_rng(0).integers(0, 255, (9, 12, 3), dtype=np.uint8)
 
 
@@ -283,23 +257,14 @@ FORMATS = {
     "result.json": Format(RESULT, mutated_json, benchmark),
     "summary.json": Format(SUMMARY, mutated_json, reported),
     "fleet.json": Format(FLEET_SUMMARY, mutated_json, reported_kind),
-    "days.csv": Format(DAY_ROWS, mutated_text, days),
-    "sessions.csv": Format(SESSION_ROWS, mutated_text, sessions),
-    "episodes.csv": Format(EPISODE_ROWS, mutated_text, resumed),
-    "timings.csv": Format(TIMING_ROWS, mutated_text, resumed),
+    "results.sqlite": Format(written(stored), mutated_bytes, resumed),
     "settings.json": Format({"seed": 0, "agents": {"mdp": {"failure_s": 1.0}}}, mutated_json, resumed),
-    "trips.jsonl": Format(
-        f"{json.dumps(TRIP)}\n{json.dumps(TRIP | {'seed': 1})}\n", mutated_text, resumed_trips
-    ),
 } | {
     f"image{end}": Format(image(end), mutated_bytes, read_image)
     for end in (".png", ".jpg", ".pgm", ".bmp", ".webp")
 }
 BESIDE = {
-    "episodes.csv": {"settings.json": '{"seed": 0, "agents": {}}'},
-    "timings.csv": {"settings.json": '{"seed": 0, "agents": {}}', "episodes.csv": EPISODE_ROWS},
-    "trips.jsonl": {"settings.json": '{"seed": 0}'},
-    "summary.json": {"episodes.csv": EPISODE_ROWS},
+    "results.sqlite": {"settings.json": '{"seed": 0, "agents": {}}'},
 }
 """Other files that stand in the folder of a file."""
 
@@ -347,10 +312,7 @@ FOUND = [
     ("summary.json", b'{"command": 5, "version": "0.1.0", "rows": []}'),
     ("summary.json", json.dumps(SUMMARY | {"seed": 1e300, "rows": [SUMMARY_ROW | {"drive_s": 1e300}]}).encode()),
     ("summary.json", json.dumps(SUMMARY).replace("30.0", "1e999").encode()),
-    ("sessions.csv", SESSION_ROWS.replace("2 1 0", "seed0 1 0").encode()),
     ("settings.json", json.dumps({"seed": "x" * 5000}).encode()),
-    ("timings.csv", TIMING_ROWS.replace("12 3", "12 <").encode()),
-    ("timings.csv", TIMING_ROWS.replace("12 3", "12 " + "9" * 400).encode()),
     ("map.yml", b"PARKING_AREAS: {A: {areas: [{shape: [2, 2015-11-12]}]}}"),
     ("experiment.json", json.dumps({"kind": "compare", "agents": ["mdp"], "scenarios": ["x" * 5000]}).encode()),
 ]  # fmt: skip
@@ -364,5 +326,5 @@ def test_what_was_found_is_refused(tmp_path, name, content):
 
 def test_a_map_whose_schema_is_no_text_is_refused(tmp_path):
     good = FORMATS["map.sqlite"].good
-    assert good.count(b"y REAL") == 1
-    read_or_refuse("map.sqlite", good.replace(b"y REAL", b"y\xffREAL"), tmp_path)
+    assert good.count(b"key TEXT") == 1
+    read_or_refuse("map.sqlite", good.replace(b"key TEXT", b"k\xffy TEXT"), tmp_path)

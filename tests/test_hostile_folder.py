@@ -22,18 +22,7 @@ MODULES = (
 def folder(tmp_path):
     """A folder with modules that leave a mark, and settings of libraries that stop or mislead them."""
     ran = tmp_path / "ran"
-    for name in [
-        "pickle",
-        "socket",
-        "queue",
-        "numpy",
-        "numba",
-        "yaml",
-        "cloudpickle",
-        "sitecustomize",
-        "parkenv",
-        "matplotlib",
-    ]:
+    for name in MODULES:
         (tmp_path / f"{name}.py").write_text(f"open({str(ran)!r}, 'a').write({name!r})")
     (tmp_path / ".numba_config.yaml").write_text(f"cache_dir: {tmp_path / 'theirs'}\ndisable_jit: 1\n")
     (tmp_path / "matplotlibrc").write_bytes(b"text.usetex: True\n\xff\xfe\n")
@@ -84,8 +73,10 @@ def test_a_users_class_is_found_after_everything_else(folder):
     assert not (folder / "ran").exists()
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("command", [["-m", "parkenv"], ["parkenv"]])
+@pytest.mark.parametrize(
+    ("command", "number", "code"),
+    [(["-m", "parkenv"], signal.SIGINT, 130), (["parkenv"], signal.SIGTERM, 143)],
+)
 def test_a_signal_before_anything_is_imported_ends_the_command(tmp_path, command, number, code):
     (tmp_path / "gymnasium.py").write_text(
         f"import os, time\nos.kill(os.getpid(), {number:d})\ntime.sleep(9)\n"

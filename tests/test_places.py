@@ -18,9 +18,8 @@ from parkenv.lots import grid_lot, write_lot
 from parkenv.scenarios.selection import by_size, lot_share, open_scenarios, scenario_of_episode, split_by_lot
 from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
 from parkenv.studies.compare.comparison import Comparison
-from parkenv.studies.training.evaluation import episode_times
 from parkenv.studies.training.spec import TrainingSpec
-from parkenv.studies.training.training import Training
+from parkenv.studies.training.training import Training, episode_times
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week import real_week_occupancy
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR

@@ -4,13 +4,11 @@ import pytest
 from small_trainings import make_small, search_training, stop_training
 
 from parkenv import InputError, make_scenario
-from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.lots import grid_lot
 from parkenv.studies.runner import run
 from parkenv.studies.training.configs import SEARCH_CONFIGS
-from parkenv.studies.training.curve_file import read_curve
-from parkenv.studies.training.evaluation import episode_times
 from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.training.training import episode_times
 from planners.learned import LearnedAgent
 
 PLACES = [make_scenario("mini"), make_scenario("campus")]
@@ -61,25 +59,3 @@ def test_a_finished_training_goes_on_with_more_steps(tmp_path):
     assert run(short, tmp_path, resume=True).summary["curve"] == after, "no more than asked is nothing to do"
     with pytest.raises(InputError, match="cannot go on"):
         run(long.changed(steps=2_000), tmp_path, resume=True)
-
-
-def test_a_training_that_stops_within_a_rollout_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch):
-    training = search_training("ppo", 2_048, 512, PLACES)
-    whole = training.train(0, tmp_path / "whole")
-    steps, step = iter(range(1_000)), SearchVecEnv.step_wait
-
-    def stops(self):
-        if next(steps) == 80:
-            raise KeyboardInterrupt
-        return step(self)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(SearchVecEnv, "step_wait", stops)
-        with pytest.raises(KeyboardInterrupt):
-            training.train(0, tmp_path / "broken")
-    assert len(read_curve(tmp_path / "broken" / "curve.csv")) > 1
-    resumed = training.train(0, tmp_path / "broken")
-    curves = [[row | {"wall_s": 0.0} for row in each] for each in (resumed, whole)]
-    assert curves[0] == curves[1]
-    models = [(tmp_path / name / "model.safetensors").read_bytes() for name in ("broken", "whole")]
-    assert models[0] == models[1]

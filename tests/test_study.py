@@ -2,11 +2,13 @@
 
 import json
 import os
+import resource
 import signal
+import sqlite3
 import subprocess
 import sys
-import time
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 from toy_study import Toy
@@ -15,11 +17,11 @@ from parkenv import InputError
 from parkenv.studies import study as studies
 from parkenv.studies.runner import Interrupted, open_run, run
 
-TOY = Toy(jobs=1)
+TOY, LONG = Toy(jobs=1), Toy(jobs=1, numbers=40)
 
 
 def files_of(folder):
-    return {path.name: path.read_text() for path in folder.iterdir()}
+    return {path.name: path.read_text() for path in folder.iterdir() if path.name != "results.sqlite"}
 
 
 def test_a_study_runs_without_a_folder_and_its_result_holds_the_files():
@@ -55,6 +57,9 @@ def test_progress_counts_what_is_finished(tmp_path):
     run(TOY.changed(numbers=7), tmp_path, resume=True, progress=lambda *news: more.append(news))
     assert more[0] == ("Searching", 12, 14)
     assert run(TOY.changed(numbers=7)).rows == open_run_of(tmp_path).rows
+    run(TOY.changed(powers=(3,), numbers=7), tmp_path, resume=True)
+    kept = (tmp_path / "powers.csv").read_text().split()
+    assert [line[0] for line in kept[1:]] == [*"3" * 7, *"2" * 7], "what was there stays, after the rest"
 
 
 def open_run_of(folder):
@@ -99,41 +104,83 @@ def test_an_interrupted_run_keeps_its_rows_and_is_resumed(tmp_path, monkeypatch)
     assert stopped.value.result.rows == [{"power": 2, "sum": 55}, {"power": 3, "sum": 0}]
     partial_summary = json.loads((tmp_path / "stopped" / "summary.partial.json").read_text())
     assert partial_summary["rows"] == stopped.value.result.rows
-    table = tmp_path / "stopped" / "powers.csv"
-    table.write_text(table.read_text() + "3,0")  # a line that a crash tore
+    assert len(Toy.table.read(tmp_path / "stopped")) == 6
     run(TOY, tmp_path / "stopped", resume=True)
     run(TOY, tmp_path / "whole")
     assert files_of(tmp_path / "stopped") == files_of(tmp_path / "whole")
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The files of an unbroken run."""
+    folder = tmp_path_factory.mktemp("whole")
+    run(LONG, folder)
+    return files_of(folder)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_a_killed_run_is_resumed_to_the_same_files(tmp_path, number):
-    out = tmp_path / "killed"
+@pytest.mark.parametrize(("number", "jobs"), [(signal.SIGKILL, 1), (signal.SIGTERM, 2), (signal.SIGINT, 1)])
+def test_a_killed_run_keeps_what_is_finished_and_is_resumed_to_the_same_files(tmp_path, whole, number, jobs):
     script = (
         "import signal, sys; from pathlib import Path; from toy_study import Toy\n"
         "from parkenv.cli.stop_signals import stop_signals; from parkenv.studies.runner import run\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background\n"
-        "with stop_signals(): run(Toy(numbers=400, pause_s=0.02, jobs=2), Path(sys.argv[1]))\n"
+        "def tell(doing, done, total): print(done, flush=True)\n"
+        "toy = Toy(numbers=40, pause_s=0.1, jobs=int(sys.argv[2]))\n"
+        "with stop_signals(): run(toy, Path(sys.argv[1]), progress=tell)\n"
     )
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     process = subprocess.Popen(
-        [sys.executable, "-c", script, out], env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.DEVNULL
+        [sys.executable, "-c", script, tmp_path, str(jobs)],
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
     )
-    deadline = time.monotonic() + 60.0
-    while not (out / "powers.csv").exists() or len((out / "powers.csv").read_text().splitlines()) < 9:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    told = next(done for line in process.stdout if (done := int(line)) >= 8)
     process.send_signal(number)
-    process.wait()
-    kept = (out / "powers.csv").read_text().splitlines()
-    assert 9 <= len(kept) < 800
-    study = Toy(numbers=400, jobs=2)
-    run(study, out, resume=True)
-    run(study, tmp_path / "whole")
-    assert set(kept[:-1]) <= set((out / "powers.csv").read_text().splitlines())
-    assert files_of(out) == files_of(tmp_path / "whole")
+    process.communicate()
+    assert told <= len(Toy.table.read(tmp_path)) < 80
+    assert (tmp_path / "powers.csv").exists() == (number != signal.SIGKILL)
+    run(LONG, tmp_path, resume=True)
+    assert files_of(tmp_path) == whole
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda file: file.write_text("this is a letter to my aunt" * 20),
+        lambda file: file.write_bytes(file.read_bytes()[:3_000]),
+        lambda file: file.write_bytes(file.read_bytes().replace(b'"value": 125', b'"value": 925')),
+        lambda file: changed(file, "UPDATE row SET value = '7', crc32 = 3_552_281_999 WHERE name <> 'head'"),
+        lambda file: changed(file, "DROP TABLE row"),
+        lambda file: changed(file, "PRAGMA user_version = 9"),
+        lambda file: file.unlink() or sqlite3.connect(file).executescript("CREATE TABLE row (name)"),
+    ],
+)
+def test_a_store_that_is_no_longer_as_it_was_written_is_named(tmp_path, damage):
+    run(TOY, tmp_path)
+    damage(tmp_path / "results.sqlite")
+    with pytest.raises(InputError, match=r"results\.sqlite: "):
+        run(TOY, tmp_path, resume=True)
+
+
+def changed(file, statement):
+    database = sqlite3.connect(file)
+    database.executescript(statement.replace("3_552_281_999", str(crc32(b"7"))))
+    database.close()
+
+
+def test_a_full_disk_ends_a_run_with_a_word_and_leaves_what_was_finished(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"results\.sqlite: cannot be written: .* is the disk full"):
+            run(LONG, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert 0 < len(Toy.table.read(tmp_path)) < 80
+    assert run(LONG, tmp_path, resume=True).rows == run(LONG).rows
 
 
 def test_errors_of_a_task_leave_what_was_finished(tmp_path, monkeypatch):
@@ -147,6 +194,6 @@ def test_errors_of_a_task_leave_what_was_finished(tmp_path, monkeypatch):
     monkeypatch.setattr(Toy, "run", fail)
     with pytest.raises(InputError, match="no cubes"):
         run(TOY, tmp_path)
-    assert len((tmp_path / "powers.csv").read_text().splitlines()) == 7
+    assert len(Toy.table.read(tmp_path)) == 6
     monkeypatch.undo()
     assert run(TOY, tmp_path, resume=True).rows[1]["sum"] == 225

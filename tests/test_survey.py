@@ -76,16 +76,16 @@ def test_a_survey_goes_on_where_it_was(tmp_path):
     run(study, tmp_path)
     (first,) = SESSIONS.read(tmp_path)
     seen = []
-    run(study.changed(sessions=2), tmp_path, progress=lambda *news: seen.append(news[1:]))
+    run(study.changed(sessions=2), tmp_path, resume=True, progress=lambda *news: seen.append(news[1:]))
     rows = SESSIONS.read(tmp_path)
     assert repr(rows[0]) == repr(first), "was not driven again"
     assert seen[:2] == [(1, 2), (2, 2)]
     # Sessions that are not in the map are driven again, and others stay.
     (tmp_path / "map.sqlite").unlink()
-    other = run(study.changed(seed=1), tmp_path)
+    other = run(study.changed(seed=1), tmp_path, resume=True)
     assert [row["key"] for row in SESSIONS.read(tmp_path)] == [study.changed(seed=1).survey.key_of(0)]
     assert other.rows[0]["sessions"] == 1
-    run(study, tmp_path)
+    run(study, tmp_path, resume=True)
     with MapStore(tmp_path / "map.sqlite", study.built.lot, create=False) as store:
         assert len(store.sessions()) == len(SESSIONS.read(tmp_path)) == 2
 

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import math
 import pathlib
 import pickle
 import shutil
@@ -10,11 +9,10 @@ import tempfile
 import zipfile
 
 import gymnasium as gym
-import jsonschema
 import numpy as np
 import pytest
 import torch
-from command_line import parkenv
+from command_line import parkenv, refused
 from gymnasium.vector import AutoresetMode
 from sb3_contrib import MaskablePPO
 from small_trainings import make_small, search_training, stop_training
@@ -27,16 +25,13 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
-from parkenv.files.spec_file import read_tables
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.study import schemas
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import MAX_STEPS, SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import read_curve
-from parkenv.studies.training.evaluation import episode_times
 from parkenv.studies.training.spec import TrainingSpec
-from parkenv.studies.training.training import TRAINING_SEEDS, Training
+from parkenv.studies.training.training import TRAINING_SEEDS, Training, episode_times
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
 from planners.agent import make_agent
@@ -54,7 +49,7 @@ EVALUATED = range(2_000_000, 2_000_020)
 def trained(tmp_path_factory):
     """A short training in a folder."""
     folder = tmp_path_factory.mktemp("trained")
-    training = search_training("maskable-ppo", 80_000, 32_768, [SCENARIO], episodes=len(EVALUATED))
+    training = search_training("maskable-ppo", 25_000, 12_288, [SCENARIO], episodes=len(EVALUATED))
     training.train(0, folder)
     return folder
 
@@ -123,7 +118,7 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
     curve = read_curve(trained / "curve.csv", ("steps", "total_s"))
     assert [row["steps"] for row in curve] == sorted(row["steps"] for row in curve)
     assert curve[0]["steps"] == 0
-    assert curve[-1]["steps"] >= 80_000
+    assert curve[-1]["steps"] >= 25_000
     best = min(row["total_s"] for row in curve)
     assert best < 60.0 < curve[0]["total_s"], "it parks now, and did not when it began"
     name = f"maskable-ppo:{trained / 'model.safetensors'}"
@@ -303,18 +298,12 @@ def test_archives_of_stable_baselines3_need_trust_and_are_converted(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in members.items():
             archive.writestr(name, content)
-    command = [
-        "compare",
-        "--scenario",
-        "mini",
-        "--agents",
-        f"maskable-ppo:{path}",
-        "--occupancy-levels",
-        "none",
-    ]
-    command += ["--no-figures", "--jobs", 1, "--episodes", 2, "--out", tmp_path / "out"]
-    refused = parkenv(*command)
-    assert (refused.returncode, "--trust-model" in refused.stderr, mark.exists()) == (2, True, False)
+    command = (
+        "compare --scenario mini --occupancy-levels none --no-figures --jobs 1 --episodes 2",
+        "--agents", f"maskable-ppo:{path}", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert "--trust-model" in refused(*command)
+    assert not mark.exists()
     done = parkenv(*command, "--trust-model")
     assert (done.returncode, mark.exists()) == (0, True), done.stderr
     made = LearnedAgent(SCENARIO, "maskable-ppo", tmp_path / "mine.safetensors")
@@ -341,7 +330,7 @@ def test_only_models_that_can_be_described_are_saved(tmp_path):
 def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
     make_small(monkeypatch)
     mark = tmp_path / "was_run"
-    torch.save({"format": "parkenv-checkpoint-1", "curve": Payload(mark)}, tmp_path / "checkpoint.pt")
+    torch.save({"format": "parkenv-checkpoint-2", "curve": Payload(mark)}, tmp_path / "checkpoint.pt")
     with pytest.raises(InputError, match="no checkpoint of this version"):
         search_training("ppo", 400, 400, [SCENARIO]).train(0, tmp_path)
     assert not mark.exists()
@@ -356,39 +345,17 @@ def checkpoint(tmp_path, monkeypatch):
     return training, tmp_path / "checkpoint.pt"
 
 
-def at(state, *keys):
-    for key in keys[:-1]:
-        state = state[key]
-    return state, keys[-1]
-
-
-AVERAGES = ("parameters", "policy.optimizer", "state", 0)
-
-
 @pytest.mark.parametrize(
-    ("keys", "value", "wanted"),
+    ("name", "value", "wanted"),
     [
-        (("numbers", "n_epochs"), "x", "n_epochs was 'x', is"),
-        (("numbers", "num_timesteps"), "x", "invalid literal"),
-        (("curve", 0, "total_s"), None, "has no column 'total_s'"),
-        (("env", "lengths"), torch.zeros(3, 3), "environment: lengths is torch.float32"),
-        (("env", "batch"), {}, "environment: batch is a dict, want a tuple"),
-        (("last", "_last_obs"), None, "last observation: _last_obs is a NoneType"),
-        (("parameters", "policy", "value_net.bias"), torch.tensor([math.nan]), "a weight is no number"),
-        ((*AVERAGES, "exp_avg"), torch.zeros(3), "averages are of other weights"),
-        ((*AVERAGES, "step"), torch.tensor(0.0), "averages are damaged"),
-        (("parameters", "policy.optimizer", "param_groups", 0, "amsgrad"), True, "have other options"),
+        ("curve", [{"steps": 0}], "has no column 'total_s'"),
+        ("last", (), "does not fit this training"),
+        ("parameters", {}, "does not fit this training"),
     ],
 )
-def test_a_checkpoint_that_does_not_fit_is_refused(checkpoint, keys, value, wanted):
+def test_a_checkpoint_that_does_not_fit_is_refused(checkpoint, name, value, wanted):
     training, path = checkpoint
-    state = torch.load(path, weights_only=True)
-    part, key = at(state, *keys)
-    if value is None and keys[0] == "curve":
-        del part[key]
-    else:
-        part[key] = value
-    torch.save(state, path)
+    torch.save(torch.load(path, weights_only=True) | {name: value}, path)
     with pytest.raises(InputError, match=wanted):
         training.train(0, path.parent)
 
@@ -439,8 +406,7 @@ def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch
         "--evaluate-every", 500, "--evaluation-episodes", 4, "--agents", "mdp", "--jobs", 1, "--out",
     ]  # fmt: skip
     assert parkenv(*command, out).returncode == 0
-    refused = parkenv(*command, out)
-    assert (refused.returncode, "--resume" in refused.stderr) == (2, True)
+    assert "--resume" in refused(*command, out)
     # The curve of the first training is that of the longer run, too.
     curve = read_curve(out / "seed_0" / "curve.csv", ("steps", "total_s"))
     assert parkenv(*command, out, "--resume", "--trainings", 2).returncode == 0
@@ -460,17 +426,10 @@ def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch
 
 
 def training_in(folder, **changed):
-    settings = {
-        "algorithm": "dqn",
-        "scenario": ["mini"],
-        "held_out": [],
-        "evaluation_episodes": 16,
-        **changed,
-    }
+    settings = {"algorithm": "dqn", "scenario": ["mini"], "held_out": [], "evaluation_episodes": 16} | changed
     (folder / "seed_0").mkdir(parents=True)
     (folder / "seed_0" / "curve.csv").write_text("steps,total_s\n0,300.0\n10,90.0\n")
     (folder / "settings.json").write_text(json.dumps(settings))
-    (folder / "trainings.csv").write_text("seed,steps,wall_s\n")
     return str(folder)
 
 
@@ -480,16 +439,6 @@ def curves_beside(folders, out):
         beside=tuple(folders),
     )  # fmt: skip
     return Training(spec).curves_beside(out)
-
-
-def test_a_specification_in_a_file_is_the_same(tmp_path):
-    tables = {"kind": "train", "algorithm": "dqn", "scenarios": ["mini"], "agents": ["mdp"], "steps": 3_000}
-    spec = TrainingSpec.parse(tables, "file")
-    spec.write(tmp_path / "experiment.json")
-    assert TrainingSpec.read(tmp_path / "experiment.json") == spec
-    jsonschema.validate(read_tables(tmp_path / "experiment.json"), schemas()["train"])
-    with pytest.raises(InputError, match="file: unknown key 'step'; did you mean 'steps'"):
-        TrainingSpec.parse({**tables, "step": 3}, "file")
 
 
 @pytest.mark.parametrize(
@@ -509,39 +458,23 @@ def test_trainings_that_make_no_sense_are_refused(fields, message):
         TrainingSpec.parse(fields, "file").training.check()
 
 
-def torn_settings(folder):
-    (folder / "settings.json").write_text("{")
-
-
-def settings_of_another_kind(folder):
-    (folder / "settings.json").write_text("[]")
-
-
-def torn_curve(folder):
-    (folder / "seed_0" / "curve.csv").write_text("steps,total_s\n0\n")
-
-
-def curve_of_another_kind(folder):
-    (folder / "seed_0" / "curve.csv").write_text("steps,success\n0,0.5\n")
+def writes(name, text):
+    return lambda folder: (folder / name).write_text(text)
 
 
 @pytest.mark.parametrize(
     ("changed", "spoil", "wanted"),
     [
-        (
-            {"scenario": ["mini", "jam"]},
-            None,
-            r"scenario is \['mini', 'jam'\] in .* and \['mini'\] here; their eval",
-        ),
+        ({"scenario": ["mini", "jam"]}, None, r"scenario is \['mini', 'jam'\] in .* and \['mini'\] here"),
         ({"evaluation_episodes": 8}, None, "evaluation_episodes is 8 in .* and 16 here"),
         ({"scenario": 5}, None, r"other/settings\.json: scenario is 5, want a list"),
         ({"scenario": [["mini"]]}, None, r"other/settings\.json: scenario\.0 is \['mini'\], want text"),
         ({"algorithm": None}, None, r"other/settings\.json: algorithm is None, want text"),
         ({}, lambda folder: shutil.rmtree(folder / "seed_0"), "holds no training"),
-        ({}, torn_settings, "settings.json: not JSON"),
-        ({}, settings_of_another_kind, "want the settings of a command"),
-        ({}, torn_curve, "curve.csv: line 2: has 1 fields"),
-        ({}, curve_of_another_kind, "curve.csv: has no column 'total_s', want steps, total_s"),
+        ({}, writes("settings.json", "{"), "settings.json: not JSON"),
+        ({}, writes("settings.json", "[]"), "want the settings of a command"),
+        ({}, writes("seed_0/curve.csv", "steps,total_s\n0\n"), "curve.csv: line 2: has 1 fields"),
+        ({}, writes("seed_0/curve.csv", "steps,success\n0,0.5\n"), "curve.csv: has no column 'total_s'"),
     ],
 )
 def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil, wanted):
@@ -552,40 +485,15 @@ def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil,
         curves_beside([folder], tmp_path / "own")
 
 
-def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
-    out = tmp_path / "out"
-    training_in(out)
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    wrong = (
-        ["dqn", "--clone", "mdp", "--overwrite"],
-        ["ppo", "--clone", "nobody", "--overwrite"],
-        ["ppo", "--agents", "belif", "--overwrite"],
-        ["ppo", "--resume", "--overwrite"],
-        ["ppo"],
-    )
-    for arguments in wrong:
-        done = parkenv("train", *arguments, "--scenario", "mini", "--out", out)
-        assert done.returncode == 2
-    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
-    done = parkenv("train", "dqn", "--clone", "mdp", "--out", tmp_path / "new")
-    assert done.returncode == 2
-    assert not (tmp_path / "new").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
         ("ppo --curriculum age", "--curriculum is 'age', want 'size'"),
         ("ppo --evaluate-on nowhere", "unknown scenario 'nowhere'"),
+        ("dqn --clone mdp", "dqn has no behaviour cloning"),
         ("ppo --resume", "to resume"),
-        ("ppo --scenario nowhere", "unknown scenario 'nowhere'"),
-        ("dqn --lot nowhere", "--lot is 'nowhere', want a packaged lot (campus, jam"),
-        ("dqn --lot nowhere.geojson", "--lot is 'nowhere.geojson', want a file; there is"),
-        ("ppo --scenario mini --day-error x", "--day-error"),
     ],
 )
 def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
-    done = parkenv("train", *arguments.split(), "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert wanted in " ".join(done.stderr.split())
+    assert wanted in refused("train", *arguments.split(), "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -18,11 +18,9 @@ from parkenv.envs.search import SearchEnv
 from parkenv.lots import packaged_lot
 from parkenv.scenarios.blind import blind_scenario
 from parkenv.scenarios.calibration import Calibration
-from parkenv.scenarios.spec import scenario_spec
-from parkenv.studies.runner import run
 from parkenv.studies.simulate import Observer
 from parkenv.studies.trips.calibration import calibrate
-from parkenv.studies.trips.calibration_study import OBSERVED, UNOBSERVED, CalibrationStudy
+from parkenv.studies.trips.calibration_study import OBSERVED, UNOBSERVED
 from parkenv.studies.trips.driven_car import (
     NO_ROOM,
     TAKEN,
@@ -471,22 +469,3 @@ def test_a_calibration_comes_back_from_its_file_and_others_are_refused(tmp_path)
         Calibration.from_file(tmp_path / "bad.json")
     with pytest.raises(InputError, match="No such file"):
         Calibration.from_file(tmp_path / "none.json")
-
-
-def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
-    study = CalibrationStudy(scenario=scenario_spec("mini"), episodes=2, seed=1, jobs=1)
-    file = tmp_path / "trips.jsonl"
-    run(study, tmp_path)
-    summary, text = (tmp_path / "summary.json").read_text(), file.read_text()
-    lines = text.splitlines(keepends=True)
-    assert len(lines) == 4
-    file.write_text(lines[0] + lines[2] + lines[3][:20])  # torn by a crash
-    seen = []
-    run(study, tmp_path, resume=True, progress=lambda *news: seen.append(news[1:]))
-    assert seen[0] == (2, 4)
-    assert file.read_text() == text
-    assert (tmp_path / "summary.json").read_text() == summary
-    with pytest.raises(InputError, match="add --resume"):
-        run(study, tmp_path)
-    with pytest.raises(InputError, match="agent was 'mdp' in"):
-        run(study.changed(agent="belief"), tmp_path, resume=True)

@@ -13,7 +13,9 @@ import pytest
 from parkenv.errors import InputError
 from parkenv.studies.workers import SERIAL, Workers, kill_workers
 
-CLUSTERS = ("ray", "dask")
+each_backend = pytest.mark.parametrize(
+    "backend", ["loky", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ray", "dask"))]
+)
 
 
 @pytest.fixture(autouse=True)
@@ -41,14 +43,14 @@ def test_results_carry_the_number_of_their_task_and_come_in_order_where_asked():
     assert list(SERIAL.results([])) == []
 
 
-@pytest.mark.parametrize("backend", ["loky", *(pytest.param(c, marks=pytest.mark.slow) for c in CLUSTERS)])
+@each_backend
 @pytest.mark.filterwarnings("ignore")
 def test_bad_input_that_a_worker_finds_is_named_as_it_is(backend):
     with of(backend) as workers, pytest.raises(InputError, match=r"^value is 3$"):
         list(workers.results([partial(killed_once.refuse, 3)] * 2))
 
 
-@pytest.mark.parametrize("backend", ["loky", *(pytest.param(c, marks=pytest.mark.slow) for c in CLUSTERS)])
+@each_backend
 @pytest.mark.filterwarnings("default")  # the libraries' own, about sockets and workers that died
 def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend):
     marker = str(tmp_path / "killed")
@@ -63,10 +65,7 @@ def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend
     assert again <= (3 if backend == "loky" else 0)
 
 
-@pytest.mark.parametrize(
-    "backend",
-    ["loky", pytest.param("ray", marks=pytest.mark.slow), pytest.param("dask", marks=pytest.mark.slow)],
-)
+@each_backend
 def test_nothing_in_the_working_folder_runs_in_place_of_pythons_own(tmp_path, backend):
     of(backend)
     for name in ("pickle", "socket", "cloudpickle", "queue"):

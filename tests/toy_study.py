@@ -6,9 +6,8 @@ from typing import ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
-from parkenv.files.csv_tables import WHOLE
 from parkenv.files.spec_file import Several
-from parkenv.studies.results import CsvTable
+from parkenv.studies.results import Table
 from parkenv.studies.study import Cell, Study
 
 
@@ -23,7 +22,7 @@ class Power(NamedTuple):
 class Toy(Study):
     """Powers of whole numbers."""
 
-    table: ClassVar = CsvTable("powers.csv", ("power", "number"), ("value",), {}, other=WHOLE, lists=None)
+    table: ClassVar = Table("powers.csv", ("power", "number"), ("value",))
     block: ClassVar = 2
     unit: ClassVar = "numbers"
 

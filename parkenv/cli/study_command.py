@@ -48,7 +48,7 @@ class StudyCommand(RunCommand):
         options = [option for option in field_options(cls) if option.name in given]
         command = made(cls, {option.name: given[option.name] for option in options if len(option.path) == 1})
         study, file = command.study, (command.out or Path()) / SPEC_FILE
-        if command.resume and (file.exists() or study.goes_on != "always"):
+        if command.resume:
             if not file.exists():
                 raise InputError(f"--resume: {command.out} holds no run to resume: no {SPEC_FILE}")
             study = type(study).read(file)

@@ -31,7 +31,7 @@ class Survey(StudyCommand):
     """Parked cars are detected in the camera images and located with the laser (or the stereo camera).
 
     A Bayes filter estimates the state of each slot. Every drive is one session of the map. Sessions are added to the
-    map in --out: the same command continues an interrupted survey, with or without --resume.
+    map in --out: --resume adds further ones to it.
     """
 
     examples = """

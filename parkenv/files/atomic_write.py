@@ -1,4 +1,4 @@
-"""Write files atomically, and append to files: complete or not at all."""
+"""Write files atomically: complete or not at all."""
 
 from __future__ import annotations
 
@@ -71,29 +71,6 @@ def _temporary(path: Path) -> Path:
     if not path.name:
         raise InputError(f"{path}: cannot be written: is no name of a file")
     return path.with_name(f".{path.name}.{os.getpid()}.part")
-
-
-def append_text(path: Path, text: str, *, sync: bool = True) -> None:
-    """Append to a file; on failure, restore the file.
-
-    Args:
-        path: the file.
-        text: the text.
-        sync: flush it to disk, so that it survives a power failure; otherwise it survives the end of this process.
-    """
-    try:
-        size = path.stat().st_size
-        try:
-            with path.open("a", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                if sync:
-                    os.fsync(file.fileno())
-        except OSError:
-            os.truncate(path, size)
-            raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def make_folder(path: Path) -> None:

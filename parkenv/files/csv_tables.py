@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import write_text
-from parkenv.files.limited_reading import MAX_BYTES, csv_records
+from parkenv.files.limited_reading import csv_records
 
 MAX_NUMBER = 1e12
 """Maximum absolute value of a number; sums and squares of larger ones could overflow."""
@@ -48,67 +48,22 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def _yes_or_no(text: str) -> bool:
-    return ("False", "True").index(text) == 1
-
-
-def _wholes(text: str, count: int | None) -> str:
-    numbers = [_whole(word) for word in text.split()]
-    if count not in (None, len(numbers)):
-        raise ValueError(text)
-    return text
-
-
-def _numbers(text: str) -> str:
-    for word in text.split():
-        _number_or_nan(word)
-    return text
-
-
 TEXT = Kind("text", str)
 NUMBER = Kind(f"a number, at most {MAX_NUMBER:g}", _number)
 NUMBER_OR_NAN = Kind(f"a number, at most {MAX_NUMBER:g}, or nan", _number_or_nan)
-NUMBERS = Kind("numbers, or nan, separated by spaces", _numbers)
 WHOLE = Kind(f"a whole number of at most {_MAX_DIGITS} digits", _whole)
-YES_OR_NO = Kind("True or False", _yes_or_no)
 
 
-def or_nothing(kind: Kind) -> Kind:
-    """Return the kind of columns that may also be empty, which is None."""
-    return Kind(f"{kind.wanted}, or nothing", lambda text: kind.parse(text) if text else None)
-
-
-NUMBER_OR_NOTHING = or_nothing(NUMBER)
-
-
-def wholes(count: int | None = None) -> Kind:
-    """Return the kind of columns that hold several whole numbers, `count` or any number of them, as a text."""
-    number = "" if count is None else f"{count} "
-    return Kind(f"{number}whole numbers separated by spaces", lambda text: _wholes(text, count))
-
-
-def typed_records(
-    path: Path,
-    kind_of: Callable[[str], Kind],
-    columns: Sequence[str] | None = None,
-    *,
-    most: int = MAX_BYTES,
-    whole_lines: bool = False,
-) -> Iterator[tuple[int, dict[str, Any]]]:
+def typed_records(path: Path, kind_of: Callable[[str], Kind]) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield the rows of a table with their line numbers; none if there is no file.
 
     Args:
         path: the file.
         kind_of: returns what a column holds, by its name.
-        columns: the columns that it must have, in order; None for any.
-        most: maximum size, bytes unpacked.
-        whole_lines: leave out a last line without its end, which a crash cut off.
     """
     if not path.exists():
         return
-    for line, record in csv_records(path, most, whole_lines=whole_lines):
-        if columns is not None and tuple(record) != tuple(columns):
-            raise InputError(f"{path}: not written by this version of parkenv; use another folder")
+    for line, record in csv_records(path):
         row = {}
         for name, text in record.items():
             kind = kind_of(name)

@@ -229,21 +229,17 @@ def read_xml(path: str | Path, root: str, most: int = MAX_BYTES // 4) -> Element
     return tree
 
 
-def csv_rows(
-    path: str | Path, most: int = MAX_BYTES, *, whole_lines: bool = False
-) -> Iterator[tuple[int, list[str]]]:
+def csv_rows(path: str | Path, most: int = MAX_BYTES) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a CSV file that are not empty, with their line numbers; all are as wide as the first.
 
     Args:
         path: the file, gzipped if its name ends in `.gz`.
         most: maximum size, bytes unpacked.
-        whole_lines: leave out a last line without its end, which a crash cut off.
     """
     width = 0
     with open_limited(path, most) as file:
         text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
-        lines = (line for line in text if line.endswith(("\n", "\r"))) if whole_lines else text
-        reader = csv.reader(lines)
+        reader = csv.reader(text)
         try:
             for row in reader:
                 width = width or len(row)
@@ -255,11 +251,9 @@ def csv_rows(
             raise InputError(f"{path}: line {reader.line_num}: not CSV: {error}") from error
 
 
-def csv_records(
-    path: str | Path, most: int = MAX_BYTES, *, whole_lines: bool = False
-) -> Iterator[tuple[int, dict[str, str]]]:
+def csv_records(path: str | Path, most: int = MAX_BYTES) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield the rows of a CSV file below its header, by the header's names, with their line numbers."""
-    rows = csv_rows(path, most, whole_lines=whole_lines)
+    rows = csv_rows(path, most)
     _, header = next(rows, (0, []))
     for line, row in rows:
         yield line, dict(zip(header, row, strict=True))

@@ -87,7 +87,7 @@ def classes_in(spec: Spec, without: Collection[str] = ()) -> list[str]:
         spec: the specification.
         without: fields to leave out.
     """
-    found: list[str] = []
+    classes: list[str] = []
     for field in (name for name in type(spec).model_fields if name not in without):
         value = getattr(spec, field)
         for part in value if isinstance(value, tuple) else (value,):
@@ -95,12 +95,12 @@ def classes_in(spec: Spec, without: Collection[str] = ()) -> list[str]:
             name = part.name if isinstance(part, AgentSpec) else part if named else None
             if isinstance(name, str) and not name.lower().endswith(DETECTOR_SUFFIXES):
                 before, colon, _ = name.partition(":")
-                found += (
+                classes += (
                     [name] if colon and (field in ("detector", "world") or before not in FILE_AGENTS) else []
                 )
             elif isinstance(part, Spec):
-                found += classes_in(part)
-    return list(dict.fromkeys(found))
+                classes += classes_in(part)
+    return list(dict.fromkeys(classes))
 
 
 def _tables(value: object) -> object:

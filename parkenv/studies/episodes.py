@@ -133,8 +133,8 @@ class EpisodeRunner:
             observers: further observers.
             moments: whether the record holds each step.
         """
-        kept: list[Moment] = []
-        recorder = SearchRecorder(self.agent, kept.append if moments else None)
+        recorded: list[Moment] = []
+        recorder = SearchRecorder(self.agent, recorded.append if moments else None)
         result = simulate(self.env, self.agent, seed, (recorder, *observers))
         metrics = {
             name: value for name, value in result.info.items() if name not in ("reward_terms", "place")
@@ -154,7 +154,7 @@ class EpisodeRunner:
             truncated=result.truncated,
             bound_s=self._bound_s(),
             decision_s=result.decision_s,
-            moments=kept,
+            moments=recorded,
         )
 
     def row(self, seed: int) -> Row:
@@ -166,8 +166,8 @@ class EpisodeRunner:
         total_s = self.agent.of_world(state.world, int(state.path[0]), state.arrival.time)
         unknown = dict.fromkeys((*METRICS, "replans", "steps"))
         times = {"arrival_s": round(state.arrival.time, 3), "occupancy": self.occupancy}
-        found = {"total_s": total_s, "truncated": False, "bound_s": self._bound_s(), DECISIONS: ""}
-        return {"seed": seed, "day": state.arrival.day, **times, "slot": "", **unknown, **found}
+        outcome = {"total_s": total_s, "truncated": False, "bound_s": self._bound_s(), DECISIONS: ""}
+        return {"seed": seed, "day": state.arrival.day, **times, "slot": "", **unknown, **outcome}
 
     @property
     def occupancy(self) -> float:

@@ -30,8 +30,8 @@ Recording = dict[str, Any]
 """Searches in a world, a drive or a day in the data of a page; its `differences` from the run are notes."""
 
 
-class Again(NamedTuple):
-    """What runs again for a page.
+class ReplayJob(NamedTuple):
+    """Searches, drives or days to run again for a page.
 
     Attributes:
         tasks: each returns a recording.
@@ -45,7 +45,7 @@ class Again(NamedTuple):
 class Replay(Protocol):
     """Something in a run that a page can show again, such as its searches."""
 
-    def again(self, options: ReportOptions) -> Again:
+    def again(self, options: ReportOptions) -> ReplayJob:
         """Return what runs again."""
 
 
@@ -122,10 +122,10 @@ class RunFolder:
         if self.kind not in STUDIES or {"--resume", "--overwrite"} & set(words):
             return words
         out, path = ("--out", "-o"), self.path if self.path.name else self.path.resolve()
-        kept = [
+        others = [
             word for word, before in zip(words, ["", *words], strict=False) if not {word, before} & {*out}
         ]
-        return [*(word for word in kept if not word.startswith("--out=")), "--out", f"{path}-again"]
+        return [*(word for word in others if not word.startswith("--out=")), "--out", f"{path}-again"]
 
     @property
     def figures(self) -> list[Path]:
@@ -166,22 +166,22 @@ def write_report(
     options = options or ReportOptions()
     path = out or run.path / PAGE
     make_folder(path.parent)
-    said, replays = [*notes], list[Replay]()
+    told, replays = [*notes], list[Replay]()
     try:
         if study is not None:
             require_unchanged(study, run.path)
             replays += study.replays(run.path)
     except (InputError, OSError) as error:
         # The page still has tables and figures.
-        said.append(f"There is no replay: {error}")
-    again = [replay.again(options) for replay in replays]
-    said += [note for its in again for note in its.notes]
-    tasks = [task for its in again for task in its.tasks]
+        told.append(f"There is no replay: {error}")
+    jobs = [replay.again(options) for replay in replays]
+    told += [note for job in jobs for note in job.notes]
+    tasks = [task for job in jobs for task in job.tasks]
     recordings = [*(options.drives or ())]
     progress(doing, 0, len(tasks))
     for number, recording in enumerate(workers.in_order(tasks), start=1):
         recordings.append(recording)
         progress(doing, number, len(tasks))
-    said += [note for recording in recordings for note in recording.get("differences", ())]
-    write_page(run.data(recordings, said), path, run.figures)
-    return path, said
+    told += [note for recording in recordings for note in recording.get("differences", ())]
+    write_page(run.data(recordings, told), path, run.figures)
+    return path, told

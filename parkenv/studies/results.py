@@ -1,34 +1,22 @@
-"""Results of a run: finished rows survive a crash.
+"""Finished rows of a run: in one SQLite file in its folder, so that they survive a crash.
 
-`settings.json` holds the settings. Every finished row is appended to the table of the study, such as a search to
-`episodes.csv` or a day with many cars to `days.csv`. `summary.json` is written at the end.
+`settings.json` holds the settings. Every finished row goes into `results.sqlite`. The tables, such as `episodes.csv` or
+`days.csv`, are written from there at the end of a run and when it is interrupted; `summary.json` is written at the end.
 """
 
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Self
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import append_text, make_folder, write_text
-from parkenv.files.csv_tables import (
-    NUMBER,
-    NUMBER_OR_NOTHING,
-    TEXT,
-    WHOLE,
-    YES_OR_NO,
-    Kind,
-    csv_columns,
-    csv_text,
-    or_nothing,
-    typed_records,
-    wholes,
-)
-from parkenv.files.limited_reading import parse_json, read_json, read_text
+from parkenv.files.atomic_write import make_folder, write_text
+from parkenv.files.csv_tables import csv_columns, csv_text, write_csv
+from parkenv.files.limited_reading import parse_json, read_json
+from parkenv.files.row_file import RowFile, to_json
 from parkenv.show.columns import SETTING_AXES
 from parkenv.studies.workers import SERIAL
 from parkenv.world.cost_terms import COST_FIELDS
@@ -40,8 +28,6 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 Key = tuple[Any, ...]
 
-MOST_BYTES = 1_000_000_000
-"""Largest table of a run: a day of a town has thousands of rows, and what was written must be read again."""
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", *SETTING_AXES)
 KEY_COLUMNS = (*SETTING_COLUMNS, "seed")
 """Columns that identify an episode of a comparison."""
@@ -65,198 +51,86 @@ OUTCOME_COLUMNS = (
 """Columns of an episode's outcome."""
 DECISIONS = "decisions_us"
 """Column of the wall times of an episode's decisions, µs."""
-KINDS: Mapping[str, Kind] = {
-    **dict.fromkeys(("scenario", "map", "agent", "day", "slot"), TEXT),
-    **dict.fromkeys(("seed", "course", "day_number", "driver"), WHOLE),
-    # `bound` drives no car.
-    **dict.fromkeys(("failed_parks", "slots_passed", "replans", "steps"), or_nothing(WHOLE)),
-    **dict.fromkeys(
-        (*COST_FIELDS, "driven_m", "walked_m", "occupancy_level", "forecast_error"), NUMBER_OR_NOTHING
-    ),
-    "parked": or_nothing(YES_OR_NO),
-    "truncated": YES_OR_NO,
-    DECISIONS: wholes(),
-}
-"""What a column of an episode holds; all others hold numbers."""
-
-GoesOn = Literal["asked", "unfinished", "always"]
-"""When a run continues the one in its folder; see `Study`."""
 SPEC_FILE = "experiment.json"
 """File in a run folder with the specification of its study."""
 SETTINGS = "settings.json"
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
 PAGE = "report.html"
+STORE = "results.sqlite"
 
 
-class Table(ABC):
-    """The table that a run appends a row to for everything that is finished.
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table of a run, stored under the name of the file that is written from it at the end.
 
     Args:
-        file: name of its file.
+        file: name of the file: a CSV table; or `.jsonl` for whole rows, a JSON object in each line.
         keys: columns that identify a row.
+        columns: the other columns of the file.
+        long: whether a row has many lines of the file: each of `columns` is a list with a value for each of them.
+        lists: name of a second file, and its columns, which hold a list for each row as a text, such as the wall times
+            of decisions; None for none.
     """
 
     file: str
     keys: Sequence[str]
+    columns: Sequence[str] = ()
+    long: bool = False
+    lists: tuple[str, Sequence[str]] | None = None
 
     def key(self, row: Mapping[str, Any]) -> Key:
         """Return the key of a row."""
         return tuple(row[c] for c in self.keys)
 
-    @abstractmethod
+    @property
+    def files(self) -> list[str]:
+        """Names of its files."""
+        return [self.file, *(self.lists or ())[:1]]
+
     def read(self, folder: Path) -> list[Row]:
-        """Read the complete lines of the file in a folder; none if there is no file."""
-
-    @abstractmethod
-    def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
-        """Yield the name of each file with its text of some rows, below a header if wanted and if it has one."""
-
-    def append(self, folder: Path, rows: Sequence[Row], *, sync: bool = True) -> None:
-        """Append rows to the file in a folder, and flush them to disk; see `append_text`."""
-        for file, text in self.texts(rows):
-            append_text(folder / file, text, sync=sync)
+        """Read the rows of the run in a folder; none if it holds none."""
+        return list(_stored(folder, [self])[self.file].values())
 
     def write(self, folder: Path, rows: Sequence[Row]) -> None:
-        """Replace the rows of the file in a folder, atomically."""
-        for file, text in self.texts(rows, header=True):
-            write_text(folder / file, text)
-
-
-@dataclass(frozen=True, eq=False)
-class CsvTable(Table):
-    """A table of numbers and texts.
-
-    Args:
-        file, keys: see `Table`.
-        columns: the other columns.
-        kinds: what a column holds.
-        other: what all other columns hold.
-        lists: name of a second file, and its columns, which hold a list for each row as a text, such as the wall times
-            of decisions; None for none.
-    """
-
-    file: str = "episodes.csv"
-    keys: Sequence[str] = KEY_COLUMNS
-    columns: Sequence[str] = OUTCOME_COLUMNS
-    kinds: Mapping[str, Kind] = field(default_factory=lambda: KINDS)
-    other: Kind = NUMBER
-    lists: tuple[str, Sequence[str]] | None = ("timings.csv", (DECISIONS,))
-
-    def read(self, folder: Path) -> list[Row]:
-        """See `Table`; a row without lists, as a crash lost them, has empty ones."""
-        rows = self._read(folder / self.file, (*self.keys, *self.columns))
-        if self.lists is not None:
-            file, columns = self.lists
-            found = {self.key(row): row for row in self._read(folder / file, (*self.keys, *columns))}
+        """Write its files."""
+        names = (*self.keys, *self.columns)
+        if self.file.endswith(".jsonl"):
+            write_text(folder / self.file, "".join(to_json(row) + "\n" for row in rows))
+        elif self.long:
+            texts = [csv_text(names, [], header=True)]
             for row in rows:
-                row |= dict.fromkeys(columns, "") | found.get(self.key(row), {})
-        return rows
-
-    def _read(self, path: Path, columns: Sequence[str]) -> list[Row]:
-        def kind_of(column: str) -> Kind:
-            return self.kinds.get(column, self.other)
-
-        return [row for _, row in typed_records(path, kind_of, columns, most=MOST_BYTES, whole_lines=True)]
-
-    def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
-        """See `Table`; lists come first: a finished row would not run again for them."""
+                n = len(row[self.columns[0]])
+                texts.append(
+                    csv_columns([*([row[c]] * n for c in self.keys), *(row[c] for c in self.columns)])
+                )
+            write_text(folder / self.file, "".join(texts))
+        else:
+            write_csv(folder / self.file, names, [{c: row.get(c) for c in names} for row in rows])
         if self.lists is not None:
             file, columns = self.lists
-            yield file, self._text((*self.keys, *columns), [r for r in rows if r.get(columns[0])], header)
-        yield self.file, self._text((*self.keys, *self.columns), rows, header)
-
-    def _text(self, columns: Sequence[str], rows: Sequence[Row], header: bool) -> str:
-        return csv_text(columns, [{c: row.get(c) for c in columns} for row in rows], header=header)
+            names = (*self.keys, *columns)
+            lists = [{c: row.get(c) for c in names} for row in rows if row.get(columns[0])]
+            write_csv(folder / file, names, lists)
 
 
-@dataclass(frozen=True, eq=False)
-class LongTable(Table):
-    """A table whose rows have many lines each: a column of a row is a list with a value for each of its lines.
-
-    Args:
-        file, keys: see `Table`.
-        line_keys: columns that tell the lines of a row apart.
-        columns: the other columns.
-        kinds: what a column holds.
-        other: what all other columns hold.
-    """
-
-    file: str
-    keys: Sequence[str]
-    line_keys: Sequence[str]
-    columns: Sequence[str]
-    kinds: Mapping[str, Kind]
-    other: Kind = NUMBER
-
-    def read(self, folder: Path) -> list[Row]:
-        """See `Table`; of lines that are there twice, as after a crash, the last one counts."""
-        in_line = (*self.line_keys, *self.columns)
-        found: dict[Key, dict[Key, Key]] = {}
-        records = typed_records(
-            folder / self.file,
-            lambda column: self.kinds.get(column, self.other),
-            (*self.keys, *in_line),
-            most=MOST_BYTES,
-            whole_lines=True,
-        )
-        for _, record in records:
-            lines = found.setdefault(self.key(record), {})
-            lines[tuple(record[c] for c in self.line_keys)] = tuple(record[c] for c in in_line)
-        return [
-            dict(zip(self.keys, key, strict=True))
-            | {c: list(values) for c, values in zip(in_line, zip(*lines.values(), strict=True), strict=True)}
-            for key, lines in found.items()
-        ]
-
-    def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
-        in_line = (*self.line_keys, *self.columns)
-        texts = [csv_text((*self.keys, *in_line), [], header=header)]
-        for row in rows:
-            n = len(row[in_line[0]])
-            texts.append(csv_columns([*([row[c]] * n for c in self.keys), *(row[c] for c in in_line)]))
-        yield self.file, "".join(texts)
-
-
-@dataclass(frozen=True, eq=False)
-class JsonTable(Table):
-    """A table whose rows hold lists: a JSON object in each line.
-
-    Args:
-        file, keys: see `Table`.
-        checked: returns a row of the file in the types of `Study.run`; raises ValueError, TypeError or KeyError if it
-            is none.
-        what: what a row is, for messages.
-    """
-
-    file: str
-    keys: Sequence[str]
-    checked: Callable[[Row], Row]
-    what: str
-
-    def read(self, folder: Path) -> list[Row]:
-        path = folder / self.file
-        if not path.exists():
-            return []
-        # A crash may leave a last line without its end.
-        whole = read_text(path, MOST_BYTES).rpartition("\n")[0]
-        rows = []
-        for number, line in enumerate(whole.splitlines(), start=1):
-            row = parse_json(line, f"{path}: line {number}")
-            try:
-                rows.append(self.checked(row))
-                self.key(rows[-1])
-            except (AttributeError, KeyError, TypeError, ValueError) as error:
-                raise InputError(f"{path}: line {number}: {line!r:.40} is not a valid {self.what}") from error
-        return rows
-
-    def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
-        del header
-        yield self.file, "".join(json.dumps(row) + "\n" for row in rows)
-
-
-EPISODES = CsvTable()
+EPISODES = Table("episodes.csv", KEY_COLUMNS, OUTCOME_COLUMNS, lists=("timings.csv", (DECISIONS,)))
 """Searches of comparisons."""
+
+
+def _store(folder: Path, *, create: bool) -> RowFile:
+    return RowFile(folder / STORE, "file of results", "a run", create=create, alone=True)
+
+
+def _stored(folder: Path, tables: Sequence[Table]) -> dict[str, dict[Key, Row]]:
+    """Return the rows of the run in a folder, by table and key; none if it holds none."""
+    if not (folder / STORE).exists():
+        return {table.file: {} for table in tables}
+    try:
+        with _store(folder, create=False) as store:
+            return {table.file: {table.key(row): row for row in store.read(table.file)} for table in tables}
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder / STORE}: a row has no key ({error!r})") from error
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
@@ -294,30 +168,30 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
     now = parse_json(json.dumps(dict(settings)), "settings")
     both = {}
     for name in sorted(before.keys() | now.keys()):
-        was, its = before.get(name), now.get(name)
-        both[name] = {**was, **its} if isinstance(was, dict) and isinstance(its, dict) else its
-        for part, old, new in _parts(name, was, its):
-            if old != new:
+        old, new = before.get(name), now.get(name)
+        both[name] = {**old, **new} if isinstance(old, dict) and isinstance(new, dict) else new
+        for part, was, wanted in _parts(name, old, new):
+            if was != wanted:
                 raise InputError(
-                    f"--resume: {part:.300} was {old!r:.200} in {folder}, now it is {new!r:.200}; "
+                    f"--resume: {part:.300} was {was!r:.200} in {folder}, now it is {wanted!r:.200}; "
                     "use the same settings, or another folder"
                 )
     return both
 
 
-def _parts(name: str, was: Any, its: Any) -> list[tuple[str, Any, Any]]:
+def _parts(name: str, old: Any, new: Any) -> list[tuple[str, Any, Any]]:
     """Pair an old and a new setting: mappings by the names that both have, nested mappings by all names."""
-    if not (isinstance(was, dict) and isinstance(its, dict)):
-        return [(name, was, its)]
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return [(name, old, new)]
     parts: list[tuple[str, Any, Any]] = []
-    for key in sorted(was.keys() & its.keys()):
-        old, new = was[key], its[key]
-        if isinstance(old, dict) and isinstance(new, dict):
+    for key in sorted(old.keys() & new.keys()):
+        was, now = old[key], new[key]
+        if isinstance(was, dict) and isinstance(now, dict):
             parts += [
-                (f"{key}.{part}", old.get(part), new.get(part)) for part in sorted(old.keys() | new.keys())
+                (f"{key}.{part}", was.get(part), now.get(part)) for part in sorted(was.keys() | now.keys())
             ]
         else:
-            parts.append((f"{name}: {key}", old, new))
+            parts.append((f"{name}: {key}", was, now))
     return parts
 
 
@@ -340,11 +214,20 @@ class Results:
         self.progress: Callable[[str, int, int], None] = lambda *_: None
         self.command: tuple[str, ...] = ()
         self._rows: dict[str, dict[Key, Row]] = {table.file: {} for table in tables}
+        self._store: RowFile | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the store; the rows stay in memory."""
+        if self._store is not None:
+            self._store.close()
+            self._store = None
 
     def read(self) -> None:
         """Read the rows that the folder holds."""
-        for table in self._tables:
-            self._rows[table.file] = {table.key(row): row for row in table.read(self.path)}
+        self._rows = _stored(self.path, self._tables)
 
     def claim(
         self,
@@ -353,39 +236,26 @@ class Results:
         *,
         resume: bool = False,
         overwrite: bool = False,
-        goes_on: GoesOn = "asked",
-    ) -> tuple[Row, bool]:
-        """Check that a run may use the folder, and read what it goes on with.
+    ) -> Row:
+        """Check that a run may use the folder, and read what it goes on with; return the settings for `begin`.
 
         Args:
             settings: settings of the run; everything that affects a row.
             kind: kind of run, for messages.
             resume: continue an earlier run with the same settings.
             overwrite: replace the results of another run.
-            goes_on: see `Study`.
-
-        Returns:
-            The settings for `begin`, and whether an earlier run is continued.
         """
         make_folder(self.path)
-        found, finished = (self.path / SETTINGS).exists(), (self.path / SUMMARY).exists()
-        if resume and goes_on != "always":
-            continues = True
-        elif goes_on == "asked":
-            if (self.path / self._tables[0].file).exists() and not overwrite:
-                state = "a finished" if finished else "an unfinished"
-                raise InputError(
-                    f"--out {self.path}: holds {state} {kind} run; add --resume to go on with it, --overwrite to "
-                    "replace it, or name another folder"
-                )
-            continues = False
-        else:
-            continues = not overwrite and (goes_on == "always" or (found and not finished))
-        if continues and goes_on != "always":
+        if resume:
             settings = require_same_settings(self.path, settings, kind)
-        if continues:
             self.read()
-        return dict(settings), continues
+        elif (self.path / SETTINGS).exists() and not overwrite:
+            state = "a finished" if (self.path / SUMMARY).exists() else "an unfinished"
+            raise InputError(
+                f"--out {self.path}: holds {state} {kind} run; add --resume to go on with it, --overwrite to "
+                "replace it, or name another folder"
+            )
+        return dict(settings)
 
     def recorded_command(self) -> tuple[str, ...]:
         """Return the command of the run that the folder holds; empty if it is lost."""
@@ -394,16 +264,16 @@ class Results:
                 return tuple(map(str, summary.get("command", ())))
         return ()
 
-    def begin(self, settings: Mapping[str, Any]) -> None:
-        """Write the settings of the run, and the rows that it goes on with.
-
-        A line that a crash has truncated is dropped, and runs again.
-        """
-        (self.path / SUMMARY).unlink(missing_ok=True)
+    def begin(self, settings: Mapping[str, Any], *, continues: bool) -> None:
+        """Write the settings of the run, and open the store, an empty one unless the run goes on with another."""
+        old = [SUMMARY, *(file for table in self._tables for file in table.files)]
+        for name in (
+            old if continues else [*old, *(f"{STORE}{ending}" for ending in ("", "-wal", "-journal"))]
+        ):
+            (self.path / name).unlink(missing_ok=True)
         write_summary(self.path, {"command": self.command, "complete": False}, SUMMARY_PARTIAL)
         write_text(self.path / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
-        for table in self._tables:
-            table.write(self.path, list(self._rows[table.file].values()))
+        self._store = _store(self.path, create=True)
 
     def rows(self, table: Table = EPISODES) -> Mapping[Key, Row]:
         """Return the finished rows of a table, by key."""
@@ -414,25 +284,41 @@ class Results:
         rows = self.rows(study.table)
         return [rows[key] for item in cell.items for key in study.keys(cell.work, item) if key in rows]
 
-    def drop(self, keys: Iterable[Key], table: Table = EPISODES) -> None:
-        """Forget rows, which run again."""
-        for key in keys:
-            del self._rows[table.file][key]
+    def replace(self, rows: Iterable[Row], table: Table) -> None:
+        """Store these rows of a table instead of those that it has."""
+        self._rows[table.file] = {table.key(row): row for row in rows}
+        if self._store is not None:
+            new = ((table.file, key, row) for key, row in self._rows[table.file].items())
+            self._store.write(new, replaces=[table.file])
 
-    def add(self, rows: Sequence[Row], table: Table = EPISODES, *, sync: bool = True) -> None:
-        """Append finished rows, and flush them to disk; see `append_text`."""
-        # Memory first: after an interruption, `put_in_order` rewrites the files from it.
-        self._rows[table.file] |= {table.key(row): row for row in rows}
-        table.append(self.path, rows, sync=sync)
+    def add(self, rows: Sequence[Row], table: Table = EPISODES) -> None:
+        """Store finished rows, with those of other tables that they hold under the names of these, all or none."""
+        new: list[tuple[str, Key, Row]] = []
+        for other in self._tables:
+            inner = [row.pop(other.file) for row in rows if other.file in row]
+            new += [(other.file, other.key(row), row) for row in inner]
+        new += [(table.file, table.key(row), row) for row in rows]
+        # Memory first: after an interruption, `put_in_order` may replace the stored rows by it.
+        for name, key, row in new:
+            self._rows[name][key] = row
+        if self._store is not None:
+            self._store.write(new)
 
-    def put_in_order(self, order: Iterable[Key], table: Table = EPISODES) -> None:
-        """Sort a table by `order`, not by when rows finished, so that the file is the same for any number of jobs.
+    def put_in_order(self, order: Mapping[tuple[str, ...], Iterable[Key]]) -> None:
+        """Sort the tables with some key columns by keys, not by when rows finished: equal for any number of jobs.
 
         Further rows of a resumed run come last.
         """
-        rows = self._rows[table.file]
-        wanted = dict.fromkeys(key for key in order if key in rows) | dict.fromkeys(rows)
-        table.write(self.path, [rows[key] for key in wanted])
+        for table in self._tables:
+            rows = self._rows[table.file]
+            keys = [key for key in order.get(tuple(table.keys), ()) if key in rows]
+            if (wanted := list(dict.fromkeys([*keys, *rows]))) != list(rows):
+                self.replace([rows[key] for key in wanted], table)
+
+    def export(self) -> None:
+        """Write the files of all tables."""
+        for table in self._tables:
+            table.write(self.path, list(self._rows[table.file].values()))
 
     def finish(self, summary: Mapping[str, Any], *, complete: bool = True) -> None:
         """Write the summary; that of an incomplete run is called `summary.partial.json`."""
@@ -441,7 +327,7 @@ class Results:
 
 
 def decision_s(row: Mapping[str, Any]) -> list[float]:
-    """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
+    """Return the wall times of an episode's decisions, s."""
     return [int(us) * 1e-6 for us in row[DECISIONS].split()]
 
 

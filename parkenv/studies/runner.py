@@ -1,15 +1,13 @@
 """The one runner of all kinds of studies: workers, lock, progress, interruption, resume, tables and summary.
 
-`run` gives blocks of items to worker processes and appends the rows that come back to the tables in the folder, so that
-an interrupted run keeps all finished rows, and a resumed run equals an uninterrupted one.
+`run` gives blocks of items to worker processes and stores the rows that come back in the folder, so that an interrupted
+run keeps all finished rows, and a resumed run equals an uninterrupted one.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import shutil
-import time
 import warnings
 import weakref
 from collections.abc import Collection, Sequence
@@ -27,13 +25,10 @@ from parkenv.files.folder_lock import only_writer
 from parkenv.files.limited_reading import read_json
 from parkenv.files.user_class import failure_of
 from parkenv.studies.agent_spec import classes_in
-from parkenv.studies.results import SETTINGS, SPEC_FILE, SUMMARY, Key, Results, Row, Table
-from parkenv.studies.study import ExecutionSpec, Progress, Stage, Study, read_study
-from parkenv.studies.workers import Task, Workers
+from parkenv.studies.results import SETTINGS, SPEC_FILE, SUMMARY, Key, Results, Row
+from parkenv.studies.study import ExecutionSpec, Progress, Stage, Study, read_study, run_tasks
+from parkenv.studies.workers import Workers
 from parkenv.version import __version__
-
-SYNC_S = 1.0
-"""Least time between two flushes of finished rows to disk if they come faster, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,35 +146,35 @@ def run(
             raise
         weakref.finalize(result, shutil.rmtree, path)
         return result
-    with warnings.catch_warnings(record=True) as found:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         study.check()
-    for warning in found:
+    for warning in caught:
         warnings.warn(warning.message, stacklevel=2)
-    said = {str(warning.message) for warning in found}
+    told = {str(warning.message) for warning in caught}
     path = Path(folder)
-    with only_writer(path), study.workers() if workers is None else nullcontext(workers) as used:
-        results = Results(path, _tables_of(study))
+    with (
+        only_writer(path),
+        study.workers() if workers is None else nullcontext(workers) as used,
+        Results(path, (study.table, *study.further_tables)) as results,
+    ):
         results.workers, results.progress = used, progress
         results.command = tuple(command or ("parkenv", "run", SPEC_FILE))
-        settings, continues = results.claim(
-            study.settings(), study.kind, resume=resume, overwrite=overwrite, goes_on=study.goes_on
-        )
-        if continues and (path / SPEC_FILE).exists():
+        settings = results.claim(study.settings(), study.kind, resume=resume, overwrite=overwrite)
+        if resume and (path / SPEC_FILE).exists():
             machines = {name: getattr(study, name) for name in ExecutionSpec.model_fields}
             # A file that is damaged, or another study's, is written anew.
             with suppress(InputError):
                 if type(study).read(path / SPEC_FILE).changed(**machines) == study:
                     results.command = results.recorded_command() or results.command
-        study.prepare(results, continues=continues)
-        results.begin(settings)
+        study.prepare(results, continues=resume)
+        results.begin(settings, continues=resume)
         study.write(path / SPEC_FILE)
         done: list[Stage] = []
         try:
-            _run_all("Compiling, once per installation", study.warm_up(), used, progress)
             for stage in study.stages(results):
                 done.append(stage)
-                _run_stage(stage, results, used, progress, said)
+                _run_stage(stage, results, used, progress, told)
             interrupted = False
         except KeyboardInterrupt:
             interrupted = True
@@ -190,6 +185,7 @@ def run(
             "seed": getattr(study, "seed", None),
         }
         summary = head | {"complete": not interrupted} | study.summarise(results)
+        results.export()
         result = Result(study, results, summary)
         if interrupted:
             results.finish(summary, complete=False)
@@ -211,47 +207,30 @@ def open_run(folder: Path | str) -> Result:
         if not (path / name).exists():
             raise InputError(f"{path}: holds no finished run: no {name}")
     study = read_study(path / SPEC_FILE)
-    results = Results(path, _tables_of(study))
+    results = Results(path, (study.table, *study.further_tables))
     results.read()
     return Result(study, results, read_json(path / SUMMARY))
 
 
-def _tables_of(study: Study) -> Sequence[Table]:
-    return study.all_tables or (study.table,)
-
-
 def _put_in_order(stages: Sequence[Stage], results: Results) -> None:
-    """Put the rows of all stages in the order of their cells, in all tables that have the same keys.
-
-    A cell may be in several stages.
-    """
-    order: dict[Table, dict[int, list[Key]]] = {}
-    alike: dict[Table, list[Table]] = {}
-    for _, study, cells in stages:
-        alike[study.table] = [table for table in _tables_of(study) if (*table.keys,) == (*study.table.keys,)]
-        of_table = order.setdefault(study.table, {})
-        for work, items in cells:
-            of_table.setdefault(id(work), []).extend(key for item in items for key in study.keys(work, item))
-    for table, of_cells in order.items():
-        for one in alike[table]:
-            results.put_in_order([key for keys in of_cells.values() for key in keys], one)
+    """Put all tables in the order of the cells: of each study, and then of its stages."""
+    cells = [(study, study.cells()) for study in {id(stage.study): stage.study for stage in stages}.values()]
+    order: dict[tuple[str, ...], list[Key]] = {}
+    for study, of_study in [*cells, *((stage.study, stage.cells) for stage in stages)]:
+        order.setdefault(tuple(study.table.keys), []).extend(
+            key for work, items in of_study for item in items for key in study.keys(work, item)
+        )
+    results.put_in_order(order)
 
 
 def _draw(result: Result, progress: Progress) -> None:
     """Write the outputs, in processes of this machine: only they can write the folder."""
     with Workers(result.study.jobs or None) as workers:
-        _run_all(result.study.writing, result.study.outputs(result), workers, progress)
-
-
-def _run_all(doing: str, tasks: Sequence[Task[object]], workers: Workers, progress: Progress) -> None:
-    if tasks:
-        progress(doing, 0, len(tasks))
-    for number, _ in enumerate(workers.results(tasks), start=1):
-        progress(doing, number, len(tasks))
+        run_tasks("Drawing figures", result.study.outputs(result), workers, progress)
 
 
 def _run_stage(
-    stage: Stage, results: Results, workers: Workers, progress: Progress, said: Collection[str] = ()
+    stage: Stage, results: Results, workers: Workers, progress: Progress, told: Collection[str] = ()
 ) -> None:
     """Run what the results do not hold yet, and add it; warnings that the user has been told are not repeated.
 
@@ -271,36 +250,27 @@ def _run_stage(
             if any(key not in finished for key in keys):
                 missing += len(keys)
                 left.append(item)
-        its: list[tuple[Any, Sequence[Any]]]
-        its = [(work, left[i : i + study.block]) for i in range(0, len(left), study.block)]
+        of_cell = [(work, left[i : i + study.block]) for i in range(0, len(left), study.block)]
         # One block of each cell first: workers then compile the functions of different agents at the same time.
-        n_first = 0 if study.keeps_order or workers.in_process else 1
-        first += its[:n_first]
-        blocks += its[n_first:]
+        n_first = 0 if workers.in_process else 1
+        first += of_cell[:n_first]
+        blocks += of_cell[n_first:]
     blocks = first + blocks
     done = total - missing
     progress(doing, done, total)
     token = "" if workers.in_process else uuid4().hex
-    tasks = [
-        partial(_run_block, token, study, study.input_of(work, block, results), block)
-        for work, block in blocks
-    ]
+    tasks = [partial(_run_block, token, study, work, block) for work, block in blocks]
     shown: set[tuple[str, str]] = set()
-    synced = -math.inf
-    numbered = enumerate(workers.in_order(tasks)) if study.keeps_order else workers.results(tasks)
-    for number, (rows, messages) in numbered:
+    for number, (rows, messages) in workers.results(tasks):
         work = blocks[number][0]
-        study.keep(work, rows, results)
-        # A row may take a millisecond, and a flush to disk a second.
-        sync = time.monotonic() >= synced + SYNC_S
-        results.add(rows, study.table, sync=sync)
-        synced = time.monotonic() if sync else synced
+        study.save_artifacts(work, rows, results)
+        results.add(rows, study.table)
         done += len(rows)
         progress(doing, done, total)
         for message in messages:
             # Numbers in the text differ between items.
             topic = study.label(work), re.sub(r"\d+", "", message)
-            if topic not in shown and message not in said:
+            if topic not in shown and message not in told:
                 shown.add(topic)
                 warnings.warn(f"{topic[0]}: {message}", stacklevel=2)
 

@@ -20,7 +20,6 @@ from parkenv.files.option import option
 from parkenv.files.spec_file import Spec, read_tables
 from parkenv.studies.results import (
     EPISODES,
-    GoesOn,
     Key,
     Results,
     Row,
@@ -51,6 +50,14 @@ STUDIES: Mapping[str, str] = {
 
 Progress = Callable[[str, int, int], None]
 """Called with what is going on, how much of it is finished, and of how much; 0 where that is not known yet."""
+
+
+def run_tasks(doing: str, tasks: Sequence[Task[object]], workers: Workers, progress: Progress) -> None:
+    """Run tasks whose results nobody needs."""
+    if tasks:
+        progress(doing, 0, len(tasks))
+    for number, _ in enumerate(workers.results(tasks), start=1):
+        progress(doing, number, len(tasks))
 
 
 def counted(progress: Progress, doing: str, total: int = 0) -> Callable[[], None]:
@@ -110,26 +117,19 @@ class Study(ExecutionSpec):
     Attributes:
         kind: name of the kind of study in files.
         table: where finished rows go.
-        all_tables: all tables of the folder, the most important first, if there are several.
+        further_tables: where what rows hold under the names of these goes.
         block: items in a task: an interruption loses few of them, and starting a task costs little.
         doing, unit: what the progress bar says and counts.
-        writing: what it says while `outputs` are written.
-        goes_on: when a run continues the one in its folder: if `asked` to resume; also if that is `unfinished`,
-            otherwise it replaces it; or `always`, whatever the settings, which the keys of rows hold.
-        keeps_order: whether rows are stored in the order of the items, instead of as they finish.
         heading: heading of the report, before the scenarios; the kind if empty.
         table_titles: titles of the tables of the report, by their entries in the summary.
     """
 
     kind: str
     table: ClassVar[Table] = EPISODES
-    all_tables: ClassVar[tuple[Table, ...]] = ()
+    further_tables: ClassVar[tuple[Table, ...]] = ()
     block: ClassVar[int] = 10
     doing: ClassVar[str] = "Searching"
     unit: ClassVar[str] = "episodes"
-    goes_on: ClassVar[GoesOn] = "asked"
-    keeps_order: ClassVar[bool] = False
-    writing: ClassVar[str] = "Drawing figures"
     heading: ClassVar[str] = ""
     table_titles: ClassVar[Mapping[str, str]] = {"rows": "Results"}
 
@@ -213,22 +213,13 @@ class Study(ExecutionSpec):
     def prepare(self, results: Results, *, continues: bool) -> None:
         """Make a folder ready for this run, or for going on with an earlier one: remove what is not in its tables."""
 
-    def warm_up(self) -> list[Task[object]]:
-        """Return tasks to run first, such as to compile what many processes would compile at the same time."""
-        return []
-
     def stages(self, results: Results) -> Iterator[Stage]:
         """Yield the stages of the run; each may depend on the results of those before."""
         del results
         yield Stage(self.doing, self, self.cells())
 
-    def input_of(self, work: Any, items: Sequence[Any], results: Results) -> Any:
-        """Return the work of a task, with what it needs from the tasks before."""
-        del items, results
-        return work
-
-    def keep(self, work: Any, rows: Sequence[Row], results: Results) -> None:
-        """Keep what of finished rows is not in the table, in the process of the run; called before they are stored."""
+    def save_artifacts(self, work: Any, rows: Sequence[Row], results: Results) -> None:
+        """Take out of finished rows what is not in tables, and write it, before they are stored."""
 
 
 class Stage(NamedTuple):
@@ -250,8 +241,8 @@ def study_class(kind: object, source: str = "") -> type[Any]:
     if not isinstance(kind, str) or kind not in STUDIES:
         raise InputError(f"{source}: kind is {kind!r}; {nearest(str(kind), STUDIES)}")
     module, _, name = STUDIES[kind].partition(":")
-    found: type[Any] = getattr(import_module(module), name)
-    return found
+    study: type[Any] = getattr(import_module(module), name)
+    return study
 
 
 def schemas() -> dict[str, dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import importlib
 import logging
@@ -31,8 +30,6 @@ from parkenv.files.known_names import BackendName
 BACKENDS = get_args(BackendName)
 CONNECT_S = 5.0
 """Time for a cluster to answer at its address, s."""
-PR_SET_PDEATHSIG = 1
-"""Option of Linux's prctl(2): the signal that a process gets when its parent ends."""
 LOSSES = 3
 """Maximum number of workers that may die in a row without finishing a task."""
 
@@ -151,8 +148,8 @@ class Workers:
         with closing(results):
             yield from results
 
-    # joblib's Ray backend returns no result before all tasks are done, and its Dask backend does not say which task
-    # failed: a crash would lose finished tasks. So use the queues of Ray and Dask themselves.
+    # Of joblib's own backends (1.6), Ray's returns no result before all tasks are done, and Dask's does not say which
+    # task failed: a crash would lose finished tasks. So use the queues of Ray and Dask themselves.
 
     def _start_ray(self, opened: ExitStack) -> None:
         # Ray reads these variables on import. The second one hides accelerators from tasks that request none; this will
@@ -236,9 +233,7 @@ SERIAL = Workers(1)
 
 def worker_start() -> dict[str, Any]:
     """Return `initializer` and `initargs` of a pool whose processes end with this one, even if it is killed."""
-    # Linux sends the signal when the thread ends that started the worker.
-    by_signal = sys.platform == "linux" and threading.current_thread() is threading.main_thread()
-    return {"initializer": _start_worker, "initargs": (os.getpid(), by_signal)}
+    return {"initializer": _start_worker, "initargs": (os.getpid(),)}
 
 
 def kill_workers() -> None:
@@ -250,17 +245,12 @@ def kill_workers() -> None:
         reusable_executor._executor.shutdown(kill_workers=True)
 
 
-def _start_worker(parent: int, by_signal: bool) -> None:
+def _start_worker(parent: int) -> None:
     # loky takes compiled code for a memory leak, and would replace the worker.
     process_executor._MAX_MEMORY_LEAK_SIZE = sys.maxsize
     # The parent says itself that functions are compiled; lines of its workers would break its progress bars.
     logging.getLogger("parkenv").setLevel(logging.ERROR)
-    if by_signal:
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    else:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    if os.getppid() != parent:  # it has ended before
-        os._exit(1)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
 def _end_with(parent: int) -> None:

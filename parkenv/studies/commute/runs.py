@@ -75,6 +75,7 @@ class CommuteRun:
     number: int  # of the repetition, from 0
     fleet: int  # number of drivers
     seed: int
+    before: Sequence[Trip] = ()  # all trips of the days before those to run
 
     @property
     def learns(self) -> bool:
@@ -102,13 +103,13 @@ class CommuteRun:
                 return LearnedMap(scenario.prior or ReversedMap(scenario.occupancy, walk), walk, GIVEN_MAP)
         return scenario.occupancy
 
-    def run(self, days: Sequence[Day], before: Sequence[Trip]) -> list[Row]:
-        """Run some days, after trips of the days before; return a row for each search, with any trip under `TRIP`."""
+    def run(self, days: Sequence[Day]) -> list[Row]:
+        """Run some days, in order; return a row for each search, with its trip under `TRIP` if trips go into a map."""
         rows: list[Row] = []
         known = self.start_map()
         agent = make_agent(self.agent.name, self.scenario, **self.agent.options)
         if isinstance(known, LearnedMap):
-            known.learn(before)
+            known.learn(self.before)
         for day in days:
             if isinstance(known, LearnedMap):
                 known.pass_time(day.count)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -24,12 +25,11 @@ from parkenv.studies.fields import (
     require_at_most,
     require_distinct_names,
 )
-from parkenv.studies.results import OUTCOME_COLUMNS, CsvTable, Key, Results, Row
+from parkenv.studies.results import EPISODES, OUTCOME_COLUMNS, Key, Results, Row, Table
 from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
-    from parkenv.mapping.trips import Trip
     from parkenv.studies.commute.runs import CommuteRun, Day
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
@@ -38,17 +38,14 @@ MAX_DAYS = 3_650  # maximum number of days of a commute
 PICTURE = "commute.png"
 
 
-class _Days(NamedTuple):
-    run: CommuteRun
-    before: list[Trip]
-
-
 class Commute(Study):
     """Drivers who come day after day, with a map that learns from their trips."""
 
-    table: ClassVar = CsvTable(
+    table: ClassVar = Table(
+        "episodes.csv",
         keys=("scenario", "map", "agent", "course", "day_number", "driver"),
         columns=("seed", *OUTCOME_COLUMNS, "forecast_error"),
+        lists=EPISODES.lists,
     )
     doing: ClassVar = "Driving"
     unit: ClassVar = "searches"
@@ -145,30 +142,26 @@ class Commute(Study):
 
     def stages(self, results: Results) -> Iterator[Stage]:
         """See `Study`: a block of days needs the maps of the days before."""
-        del results
-        for first in range(0, self.days, self.block):
-            doing = f"{self.doing}, days {first + 1} to {min(first + self.block, self.days)}"
-            yield Stage(
-                doing, self, [Cell(run, days[first : first + self.block]) for run, days in self.cells()]
-            )
-
-    def input_of(self, work: CommuteRun, items: Sequence[Day], results: Results) -> _Days:
         from parkenv.mapping.store import MapStore
+        from parkenv.mapping.trips import Trip
         from parkenv.studies.commute.runs import map_file
         from parkenv.world.week import DAY_S
 
-        before: list[Trip] = []
-        if work.learns:
-            with MapStore(map_file(results.path, work), work.scenario.lot) as store:
-                before = [trip for trip in store.trips() if trip.time < items[0].count * DAY_S]
-        return _Days(work, before)
+        for first in range(0, self.days, self.block):
+            doing = f"{self.doing}, days {first + 1} to {min(first + self.block, self.days)}"
+            cells = []
+            for run, days in self.cells():
+                block, before = days[first : first + self.block], list[Trip]()
+                if run.learns and block:
+                    with MapStore(map_file(results.path, run), run.scenario.lot) as store:
+                        before = [trip for trip in store.trips() if trip.time < block[0].count * DAY_S]
+                cells.append(Cell(replace(run, before=before), block))
+            yield Stage(doing, self, cells)
 
-    def run(self, work: Any, items: Sequence[Day]) -> list[Row]:
-        run, before = work
-        rows: list[Row] = run.run(items, before)
-        return rows
+    def run(self, work: CommuteRun, items: Sequence[Day]) -> list[Row]:
+        return work.run(items)
 
-    def keep(self, work: CommuteRun, rows: Sequence[Row], results: Results) -> None:
+    def save_artifacts(self, work: CommuteRun, rows: Sequence[Row], results: Results) -> None:
         from parkenv.mapping.store import MapStore
         from parkenv.studies.commute.runs import TRIP, map_file
 

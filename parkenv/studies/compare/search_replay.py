@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from parkenv.show.scene import LotScene
 from parkenv.show.search_record import SearchRecord
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording
+from parkenv.studies.report import AGREES_S, MOST_SLOTS, Recording, ReplayJob
 from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import EPISODES
 from parkenv.world.cost_terms import COST_FIELDS
@@ -50,7 +50,7 @@ class SearchReplay(NamedTuple):
     cases: Sequence[tuple[Case, Sequence[int]]]
     folder: Path
 
-    def again(self, options: ReportOptions) -> Again:
+    def again(self, options: ReportOptions) -> ReplayJob:
         """See `Replay`; lots with too many slots are left out."""
         agents = options.chosen_agents([case.label for case, _ in self.cases])
         cases = [(case, seeds) for case, seeds in self.cases if case.label in agents]
@@ -77,7 +77,7 @@ class SearchReplay(NamedTuple):
         for encounter in encounters:
             keys = [case.key(encounter.seed) for case in encounter.cases]
             tasks.append(partial(replay, encounter, {key: totals[key] for key in keys if key in totals}))
-        return Again(tasks, notes)
+        return ReplayJob(tasks, notes)
 
 
 def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[Encounter]:

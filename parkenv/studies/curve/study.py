@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from pydantic import Field
 
 from parkenv.errors import InputError
-from parkenv.files.csv_tables import TEXT
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.fields import TRAFFIC, ScenarioList, Values
 from parkenv.studies.fleet.setting import OWN, Demanded, times_demanded
 from parkenv.studies.fleet.spec import FleetSpec
-from parkenv.studies.results import CsvTable, Results, Row, Table
+from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.study import counted
 from parkenv.studies.workers import Task
 from parkenv.world.week import HOUR_S
@@ -31,12 +30,10 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 PICTURE = "curve.png"
-HELD_OUT = CsvTable(
+HELD_OUT = Table(
     "held_out.csv",
     ("scenario", "zone", "hour", "multiple"),
     ("cars", "occupancy", "measured", "predicted"),
-    {"scenario": TEXT, "zone": TEXT},
-    lists=None,
 )
 """Search times, s, of zones that were held out, by hour and demand: in the mean of the days, and by the curve that was
 fitted to the others."""
@@ -99,10 +96,10 @@ class CurveStudy(FleetSpec):
         return {name: LoneSearches(goals) for name, goals in self._goals.items()}
 
     @property
-    def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
+    def further_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
         from parkenv.studies.curve.zones import ZONES
 
-        return (self.table, ZONES)
+        return (ZONES, HELD_OUT)
 
     def day_tables(self, day: Day) -> dict[str, Row]:
         from parkenv.studies.curve.zones import ZONES, day_of_zones
@@ -164,7 +161,7 @@ class CurveStudy(FleetSpec):
         fits = len(OUTCOMES) * (len([*held_out_parts(paths, self.seed)]) + 1 + self.bootstraps)
         how = self.seed, results.workers, counted(results.progress, "Fitting curves", fits)
         errors, held_out = held_out_errors(paths, *how)
-        HELD_OUT.write(results.path, held_out)
+        results.replace(held_out, HELD_OUT)
         write_curves(paths, curve_table(paths, self.bootstraps, *how), results.path)
         zones = {name: len(zones.names) for name, zones in self.zones.items()}
         return summary | {"zones": zones, "reach_m": self.reach_m, "errors": errors}
@@ -179,7 +176,7 @@ class CurveStudy(FleetSpec):
 
         if "zones" not in result.summary:
             return []
-        curves, points = load_curves(result.folder).curves, HELD_OUT.read(result.folder)
+        curves, points = load_curves(result.folder).curves, [*result.results.rows(HELD_OUT).values()]
         tasks: list[Task[object]] = []
         errors = [r for r in result.summary["errors"] if r["held_out"] == "zones"][:1]
         off = {key: row[key] for row in errors for key in (*PREDICTORS, "chance")}

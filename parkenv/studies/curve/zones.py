@@ -15,7 +15,7 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.studies.curve.lone_search import LoneSearches
 from parkenv.studies.fleet.day import Day
 from parkenv.studies.fleet.setting import SETTING_COLUMNS
-from parkenv.studies.results import JsonTable, Row
+from parkenv.studies.results import Table
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import HOUR_S
 
@@ -30,14 +30,7 @@ STATE = ("occupancy", "demand", "town_occupancy", "town_demand")
 spaces of the lot, by hour."""
 
 
-def _checked(row: Row) -> Row:
-    whole = np.array([row[name] for name in (*INDEX, *SUMS)], float)
-    if whole.ndim != 2 or [np.array(row[name], float).ndim for name in STATE] != [2, 2, 1, 1]:
-        raise ValueError("lists of other shapes")
-    return row
-
-
-ZONES = JsonTable("zones.jsonl", (*SETTING_COLUMNS, "day"), _checked, "day of zones")
+ZONES = Table("zones.jsonl", (*SETTING_COLUMNS, "day"))
 """A line for each day: `SUMS` where cars arrive, with the numbers of zone, purpose and hour, and `STATE`. Hours
 count from the first of the day's arrivals."""
 

@@ -18,7 +18,7 @@ from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, OneS
 from parkenv.studies.results import EPISODES, Results, Row, Table, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
-from parkenv.studies.study import Cell, Stage
+from parkenv.studies.study import Cell, Stage, run_tasks
 from parkenv.studies.workers import Task
 from parkenv.version import __version__
 
@@ -60,10 +60,9 @@ class Demo(CaseStudy):
     """A survey, and searches on other days with its map."""
 
     block: ClassVar = 1
-    goes_on: ClassVar = "unfinished"
     heading: ClassVar = "From a survey to a search"
     table_titles: ClassVar = {"rows": "Searches with simulated sensors"}
-    all_tables: ClassVar[tuple[Table, ...]] = (EPISODES, SESSIONS)
+    further_tables: ClassVar[tuple[Table, ...]] = (SESSIONS,)
 
     kind: Literal["demo"] = "demo"
     scenario: Annotated[OneScenario, Inside(only=())] = scenario_spec("campus")
@@ -112,10 +111,6 @@ class Demo(CaseStudy):
             "detector": detector_version(self.detector or self.scenario.detector),
         }
 
-    def warm_up(self) -> list[Task[object]]:
-        """See `Study`: two tasks that share few functions, a short survey and searches without sensors."""
-        return [partial(_short_survey, self.survey.drive_settings), _short_searches]
-
     def prepare(self, results: Results, *, continues: bool) -> None:
         from parkenv.show.figures.lot import save_lot_picture
 
@@ -124,6 +119,9 @@ class Demo(CaseStudy):
         results.progress(f"The lot: {results.path / LOT}", 1, 1)
 
     def stages(self, results: Results) -> Iterator[Stage]:
+        """See `Study`; what many processes would compile at the same time is compiled first, by two tasks."""
+        first: list[Task[object]] = [partial(_short_survey, self.survey.drive_settings), _short_searches]
+        run_tasks("Compiling, once per installation", first, results.workers, results.progress)
         yield from self.survey.stages(results)
         yield Stage("2/3 searches through the sensors", self, self.cases_in(results.path))
         yield Stage("3/3 searches without images", self, self.more_cases_in(results.path))

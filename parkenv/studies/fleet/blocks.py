@@ -16,40 +16,32 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.engine.records import BALKED, GAVE_UP, STATES, TRUNCATED
-from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.studies.fleet.day import ALL, Day
-from parkenv.studies.fleet.setting import KINDS, NOWHERE, SETTING_COLUMNS
+from parkenv.studies.fleet.setting import NOWHERE, SETTING_COLUMNS
 from parkenv.studies.fleet.tables import day_means
-from parkenv.studies.results import LongTable, Row
+from parkenv.studies.results import Row, Table
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
 from parkenv.world.tariff import NO_ZONE
 from parkenv.world.week import DAY_S, HOUR_S
 
 _DAY = (*SETTING_COLUMNS, "day")
-_KINDS = {
-    **KINDS,
-    **dict.fromkeys(("block", "type", "zone", "purpose"), TEXT),
-    **dict.fromkeys(("hour", "slots", "arrivals", "refused", "departures", "lane", *STATES), WHOLE),
-    **dict.fromkeys(("occupancy", "search_s", "walk_s", "cruised_m"), NUMBER_OR_NAN),
-}
-BLOCKS = LongTable(
+BLOCKS = Table(
     "blocks.csv",
     _DAY,
-    ("block", "purpose", "hour"),
     (
-        "type", "zone", "slots", "occupancy", "arrivals", "refused", "departures", "search_s", "walk_s", "cruised_m",
-        "paid",
+        "block", "purpose", "hour", "type", "zone", "slots", "occupancy", "arrivals", "refused", "departures",
+        "search_s", "walk_s", "cruised_m", "paid",
     ),
-    _KINDS,
+    long=True,
 )  # fmt: skip
 """What happens in each block in each hour of a day, to cars of each purpose and of all: the share of its slots that
 they take; cars that park there, failed attempts, cars that leave; of those that park, the means of search time, walk
 and detour, and what they pay for their stays. The arrivals of `NOWHERE` are the cars that go elsewhere. Hours count
 from the midnight before the first arrival."""
-LANES = LongTable("lanes.csv", _DAY, ("lane", "hour"), ("driven_m", "cruised_m"), _KINDS)
+LANES = Table("lanes.csv", _DAY, ("lane", "hour", "driven_m", "cruised_m"), long=True)
 """What searching cars drive in each lane in each hour of a day, and how much of it is a detour; see `LaneCounts`."""
-HOURS = LongTable("hours.csv", _DAY, ("purpose", "hour"), STATES, _KINDS)
+HOURS = Table("hours.csv", _DAY, ("purpose", "hour", *STATES), long=True)
 """Where the cars of a day are at the end of each hour: every car is in one of the states."""
 TABLES = (BLOCKS, LANES, HOURS)
 MEANS = (
@@ -129,9 +121,8 @@ def day_rows(day: Day) -> dict[str, Row]:
     }
 
 
-def _row(table: LongTable, *columns: NDArray[Any]) -> Row:
-    names = (*table.line_keys, *table.columns)
-    return {name: values.tolist() for name, values in zip(names, columns, strict=True)}
+def _row(table: Table, *columns: NDArray[Any]) -> Row:
+    return {name: values.tolist() for name, values in zip(table.columns, columns, strict=True)}
 
 
 def _block_row(day: Day, hours: IntArray) -> Row:
@@ -262,7 +253,7 @@ def _day_by(row: Row, by: str) -> dict[str, Row]:
 
 def _grid(row: Row, by: str) -> tuple[list[str], IntArray, dict[str, FloatArray]]:
     """Return zones, blocks or purposes and hours of a day, a row of `BLOCKS`, and sums by them, (n, n_hours) each."""
-    every = {column: np.array(row[column]) for column in (*BLOCKS.line_keys, *BLOCKS.columns)}
+    every = {column: np.array(row[column]) for column in BLOCKS.columns}
     chosen = (every["purpose"] == ALL) == (by != "purpose")
     if by != "purpose":
         chosen &= every["block"] != NOWHERE

@@ -16,7 +16,7 @@ from parkenv.show.report.town_map import town_data
 from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, TABLES, Blocks, by_hour
 from parkenv.studies.fleet.day import ALL
 from parkenv.studies.fleet.setting import Setting
-from parkenv.studies.report import Again, Recording
+from parkenv.studies.report import Recording, ReplayJob
 from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Row, without_nan
 from parkenv.world.scenario import Scenario
@@ -45,11 +45,11 @@ class DayMaps(NamedTuple):
     study: FleetStudy
     folder: Path
 
-    def again(self, options: ReportOptions) -> Again:
+    def again(self, options: ReportOptions) -> ReplayJob:
         """See `Replay`: nothing runs again, the maps are in the tables of the run."""
         del options
         rows = {table.file: table.read(self.folder) for table in TABLES}
-        return Again([partial(dict, recording) for recording in map_recordings(self.study, rows)])
+        return ReplayJob([partial(dict, recording) for recording in map_recordings(self.study, rows)])
 
 
 def write_map_page(study: FleetStudy, summary: Row, rows: Rows, folder: Path) -> None:

@@ -15,7 +15,7 @@ from parkenv.engine.fleet import Fleet
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.show.scene import LotScene
 from parkenv.studies.fleet.setting import Setting, rate_text
-from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording
+from parkenv.studies.report import AGREES_S, MOST_SLOTS, Recording, ReplayJob
 from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Key
 from parkenv.world.scenario import Scenario
@@ -44,17 +44,17 @@ class FleetReplay(NamedTuple):
     study: FleetStudy
     folder: Path
 
-    def again(self, options: ReportOptions) -> Again:
+    def again(self, options: ReportOptions) -> ReplayJob:
         """See `Replay`; lots with too many slots or counted ones, and days with too many cars, are left out."""
         study = self.study
         agents = options.chosen_agents([setting.agent.label for setting in study.fleet_settings])
         numbers = options.chosen_numbers(range(study.days))
         if (n := max(scenario.lot.n_slots for scenario in study.built.values())) > MOST_SLOTS:
-            return Again(
+            return ReplayJob(
                 notes=[f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
             )
         if any((scenario.lot.capacity > 1).any() for scenario in study.built.values()):
-            return Again(notes=["counted facilities have no slots to draw: no replay; the map has them"])
+            return ReplayJob(notes=["counted facilities have no slots to draw: no replay; the map has them"])
         settings = [one for one in study.fleet_settings if one.agent.label in agents]
         rows = study.table.read(self.folder)
         crowded = {row["arrivals_per_hour"] for row in rows if row["cars"] > MOST_CARS}
@@ -66,7 +66,7 @@ class FleetReplay(NamedTuple):
         settings = [one for one in settings if one.arrivals_per_hour not in rates]
         chosen = choose_days(study, settings, DAYS if options.episodes is None else options.episodes, numbers)
         totals = {study.table.key(row): row["total_s"] for row in rows}
-        return Again([partial(record_day, study, setting, day, totals) for setting, day in chosen], notes)
+        return ReplayJob([partial(record_day, study, setting, day, totals) for setting, day in chosen], notes)
 
 
 def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[Key, float]) -> Recording:

@@ -19,7 +19,7 @@ from parkenv.scenarios.purposes import PurposeSpec
 from parkenv.scenarios.spec import Date, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
-from parkenv.studies.results import JsonTable, Results, Row, Table
+from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.study import Cell, Stage, Study, counted
 from parkenv.world.week import HOUR_S
 
@@ -55,22 +55,8 @@ class _RollOut(NamedTuple):
         return {"roll_out": self.number}
 
 
-def _fitted(row: Row) -> Row:
-    for fit in row["car_parks"].values():
-        PurposeSpec.parse(fit["purpose"], "purpose")
-        np.array([fit[column] for column in ("followed", "driven", "aim")], np.float64)
-    return row
-
-
-def _driven(row: Row) -> Row:
-    numbers = np.array([row[column] for column in ("hour", "counted", *PREDICTIONS)], np.float64)
-    if numbers.shape[1:] != (len(row["car_park"]),):
-        raise ValueError(numbers.shape)
-    return row
-
-
-FITTED = JsonTable("fitted.jsonl", ("roll_out", "kind"), _fitted, "fitted demand")
-DAYS = JsonTable("days.jsonl", ("date",), _driven, "day held out")
+FITTED = Table("fitted.jsonl", ("roll_out", "kind"))
+DAYS = Table("days.jsonl", ("date",))
 """Days held out; see `CountedTown.predicted`."""
 
 
@@ -87,7 +73,7 @@ class DemandStudy(Study):
     """
 
     table: ClassVar[Table] = DAYS
-    all_tables: ClassVar = (DAYS, FITTED)
+    further_tables: ClassVar = (FITTED,)
     block: ClassVar = 1
     doing: ClassVar = "Driving days held out"
     unit: ClassVar = ""
@@ -176,15 +162,15 @@ class DemandStudy(Study):
         counts = self.town.counts
         done = counted(results.progress, "Forecasting", FIT_STEPS)
         settings = fit_settings(counts, self._first_held_out, done)
-        results.kept["forecast"] = forecast_days(counts, 0, "rolling", settings).occupancy
-        yield Stage(self.doing, self, self.cells())
-
-    def input_of(self, work: _RollOut, items: Sequence[Any], results: Results) -> _RollOut:
-        town = self.town
-        day = town.counts.day_index(date.fromisoformat(items[0]))
-        before, expected = town.expected(results.kept["forecast"], np.array([day]))
-        fit = results.rows(FITTED)[work.number, kind_of(town.counts.weekday[day])]
-        return work._replace(fit=fit["car_parks"], expected=(before[0], expected[0]))
+        forecast = forecast_days(counts, 0, "rolling", settings).occupancy
+        cells = []
+        for work, dates in self.cells():
+            for text in dates:
+                day = counts.day_index(date.fromisoformat(text))
+                before, expected = self.town.expected(forecast, np.array([day]))
+                fit = results.rows(FITTED)[work.number, kind_of(counts.weekday[day])]["car_parks"]
+                cells.append(Cell(work._replace(fit=fit, expected=(before[0], expected[0])), [text]))
+        yield Stage(self.doing, self, cells)
 
     def run(self, work: _RollOut, items: Sequence[Any]) -> list[Row]:
         day = self.town.counts.day_index(date.fromisoformat(items[0]))
@@ -306,10 +292,6 @@ class _Fits(DemandStudy):
 
     def cells(self) -> list[Cell]:
         return [Cell(_RollOut(number), tuple(KINDS)) for number in range(self.roll_outs)]
-
-    def input_of(self, work: _RollOut, items: Sequence[Any], results: Results) -> _RollOut:
-        del items, results
-        return work
 
     def run(self, work: _RollOut, items: Sequence[Any]) -> list[Row]:
         (kind,), (followed, _) = items, self.days(work.number)

@@ -7,7 +7,6 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, WithJsonSchema
 
-from parkenv.files.csv_tables import NUMBER_OR_NAN, NUMBERS, TEXT, WHOLE, Kind, wholes
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.results import Row
 from parkenv.world.cost_terms import COST_FIELDS
@@ -64,15 +63,6 @@ _NUMBER_OR_TIMES = {
 }  # fmt: skip
 Demanded = Annotated[float | str, BeforeValidator(rate_of), WithJsonSchema(_NUMBER_OR_TIMES)]
 """Cars an hour, or multiples of the demand that is given or counted."""
-KINDS = {
-    **dict.fromkeys(("scenario", "agents", "knows"), TEXT),
-    **dict.fromkeys(("day", "cars"), WHOLE),
-    **dict.fromkeys(("members_s", "others_s", "counted_occupancy", "clairvoyant_s"), NUMBER_OR_NAN),
-    **dict.fromkeys(BY_HOUR, NUMBERS),
-    **dict.fromkeys(CAR_LISTS, wholes()),
-    "arrivals_per_hour": Kind(_WANTED, rate_of),
-}
-"""What a column of a day holds; all others hold numbers."""
 
 
 @dataclass(frozen=True)

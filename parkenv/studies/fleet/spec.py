@@ -36,7 +36,6 @@ from parkenv.studies.fleet.setting import (
     CAR_LISTS,
     COUNTED,
     GIVEN,
-    KINDS,
     MEASURES,
     OWN,
     SETTING_COLUMNS,
@@ -44,7 +43,7 @@ from parkenv.studies.fleet.setting import (
     Setting,
     times_demanded,
 )
-from parkenv.studies.results import CsvTable, Results, Row
+from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.study import Cell, Study
 
 if TYPE_CHECKING:
@@ -66,11 +65,10 @@ OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
 class FleetSpec(Study):
     """Days of many cars in settings: each setting has a scenario, an agent, information of members, and a demand."""
 
-    table: ClassVar = CsvTable(
+    table: ClassVar = Table(
         "days.csv",
         keys=(*SETTING_COLUMNS, "day"),
         columns=("cars", *MEASURES, *BY_HOUR),
-        kinds=KINDS,
         lists=("cars.csv", CAR_LISTS),
     )
     block: ClassVar = 1
@@ -346,11 +344,6 @@ class FleetSpec(Study):
 
     def run(self, work: Setting, items: Sequence[int]) -> list[Row]:
         return [self.run_day(work, day) for day in items]
-
-    def keep(self, work: Setting, rows: Sequence[Row], results: Results) -> None:
-        del work
-        for table in self.all_tables[1:]:
-            results.add([row.pop(table.file) for row in rows], table, sync=False)
 
     def label(self, work: Setting) -> str:
         return work.agent.label

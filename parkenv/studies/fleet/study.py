@@ -45,10 +45,10 @@ class FleetStudy(FleetSpec):
         return [by_scenario[name] for name in self.built]
 
     @property
-    def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
+    def further_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
         from parkenv.studies.fleet.blocks import TABLES
 
-        return (self.table, *TABLES)
+        return TABLES
 
     def day_tables(self, day: Day) -> dict[str, Row]:
         from parkenv.studies.fleet.blocks import day_rows

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.show.report.drive_recording import record_drive
-from parkenv.studies.report import Again, Recording
+from parkenv.studies.report import Recording, ReplayJob
 from parkenv.studies.report_options import ReportOptions
 from parkenv.world.scenario import Scenario
 
@@ -19,10 +19,12 @@ class DriveReplay(NamedTuple):
     settings: SurveySettings
     sessions: int
 
-    def again(self, options: ReportOptions) -> Again:
+    def again(self, options: ReportOptions) -> ReplayJob:
         numbers = range(min(options.sessions, self.sessions) if options.drives is None else 0)
         frames = options.frames // max(len(numbers), 1)
-        return Again([partial(_drive, self.scenario, self.settings, number, frames) for number in numbers])
+        return ReplayJob(
+            [partial(_drive, self.scenario, self.settings, number, frames) for number in numbers]
+        )
 
 
 def _drive(scenario: Scenario, settings: SurveySettings, number: int, frames: int) -> Recording:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -15,11 +15,10 @@ from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import Hours, scenario_spec
 from parkenv.show.plurals import plural, slots_text
 from parkenv.studies.fields import PRICES, CaptureDistance, Detector, OneScenario, Seed, with_traffic
-from parkenv.studies.results import Key, Results, Row, without_nan
+from parkenv.studies.results import SETTINGS, Key, Results, Row, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
-from parkenv.studies.study import Cell, Study
+from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.workers import Task
-from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
@@ -43,8 +42,6 @@ class SurveyStudy(Study):
     block: ClassVar = 1
     doing: ClassVar = "Driving (compiles first after an installation)"
     unit: ClassVar = "sessions"
-    goes_on: ClassVar = "always"
-    keeps_order: ClassVar = True
     heading: ClassVar = "Survey"
 
     kind: Literal["survey"] = "survey"
@@ -136,8 +133,8 @@ class SurveyStudy(Study):
         self.survey.key_of(0)
 
     def settings(self) -> Row:
-        """See `Study`: the keys of sessions hold the others."""
-        return {"version": __version__}
+        """See `Study`: none, since the keys of sessions hold all; a map goes on with any others."""
+        return {}
 
     def cells(self) -> list[Cell]:
         return [Cell("survey", range(self.sessions))]
@@ -158,16 +155,24 @@ class SurveyStudy(Study):
         return self.survey.drive(number, pictures=PICTURES if number == 0 else 0), None
 
     def prepare(self, results: Results, *, continues: bool) -> None:
-        """See `Study`; sessions that are not in the map are driven again."""
+        """See `Study`; a map without a run, such as that of recorded drives, stays and goes on."""
         from parkenv.mapping.store import MapStore
 
         file = results.path / MAP_FILE
-        if not continues:
+        if not continues and (results.path / SETTINGS).exists():
             file.unlink(missing_ok=True)
-        with MapStore(file, self.built.lot) as store:
-            results.drop([key for key in results.rows(self.table) if not store.has(key[0])], self.table)
+        MapStore(file, self.built.lot).close()
 
-    def keep(self, work: Any, rows: Sequence[Row], results: Results) -> None:
+    def stages(self, results: Results) -> Iterator[Stage]:
+        """See `Study`; sessions that are not in the map are driven again."""
+        from parkenv.mapping.store import MapStore
+
+        with MapStore(results.path / MAP_FILE, self.built.lot) as store:
+            rows = results.rows(self.table).items()
+            results.replace([row for (key,), row in rows if store.has(key)], self.table)
+        yield Stage(self.doing, self, self.cells())
+
+    def save_artifacts(self, work: Any, rows: Sequence[Row], results: Results) -> None:
         """See `Study`: sessions go into the map."""
         from parkenv.mapping.store import MapStore
 

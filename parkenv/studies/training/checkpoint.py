@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,13 @@ import torch
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 
-_FORMAT = "parkenv-checkpoint-1"
+_FORMAT = "parkenv-checkpoint-2"
 _LAST = ("_last_obs", "_last_episode_starts")
 _COUNTERS = (
     "num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "start_time", "_episode_num", "_n_updates",
     "_n_calls", "_current_progress_remaining", "exploration_rate",
 )  # fmt: skip
 """Numbers of a model that change while it learns; all others are its settings."""
-_ADAM = {"step", "exp_avg", "exp_avg_sq"}
 
 Row = dict[str, Any]
 
@@ -41,9 +39,10 @@ def save_checkpoint(path: Path, model: Any, curve: list[Row]) -> None:
     state = {
         "format": _FORMAT,
         "curve": _plain(curve),
-        "numbers": _numbers(model),
+        "n_envs": model.n_envs,
+        "counters": _counters(model),
         "parameters": model.get_parameters(),
-        "last": _tensors({name: getattr(model, name) for name in _LAST}),
+        "last": _tensors([getattr(model, name) for name in _LAST]),
         "memory": _tensors(getattr(model, "_last_lstm_states", None)),
         "buffer": None if buffer is None else _tensors(_transitions(buffer)),
         "env": _tensors(model.env.get_state()),
@@ -74,7 +73,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], list[Row]]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if state["format"] != _FORMAT:
             raise ValueError(f"its format is {state['format']!r}, want {_FORMAT!r}")
-        if not isinstance(n_envs := state["numbers"]["n_envs"], int):
+        if not isinstance(n_envs := state["n_envs"], int):
             raise ValueError(f"n_envs is {n_envs!r:.40}")
         return state, _plain(state["curve"])
     except Exception as error:  # torch raises many types for damaged files
@@ -84,37 +83,19 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], list[Row]]:
 
 
 def restore(state: Mapping[str, Any], model: Any) -> None:
-    """Bring a new model with the same settings, its environment and the random generators to a checkpoint.
-
-    Types and shapes are checked. Values are not: where the searches stood is taken at its word.
-    """
+    """Bring a new model with the same settings, its environment and the random generators to a checkpoint."""
     try:
-        first = {
-            "_last_obs": model.env.reset(),
-            "_last_episode_starts": np.ones(model.n_envs, dtype=np.bool_),
-        }
-        _require_like(state["last"], _tensors(first), "last observation")
-        _require_like(state["env"], _tensors(model.env.get_state()), "environment")
-        for name, value in _numbers(model).items():
-            saved = state["numbers"][name]
-            if saved != value and name not in _COUNTERS:
-                raise ValueError(f"{name} was {saved!r:.40}, is {value!r}")
-            setattr(model, name, type(value)(saved))
-        options = _options(model)
+        for name, value in _counters(model).items():
+            setattr(model, name, type(value)(state["counters"][name]))
         model.set_parameters(state["parameters"], device="cpu")
-        if _options(model) != options:
-            raise ValueError("the optimizers have other options")
-        _require_sound_weights(model)
-        for name, value in _arrays(state["last"]).items():
+        for name, value in zip(_LAST, _arrays(state["last"]), strict=True):
             setattr(model, name, value)
         if (memory := getattr(model, "_last_lstm_states", None)) is not None:
-            _require_like(state["memory"], _tensors(memory), "memory")
-            model._last_lstm_states = type(model._last_lstm_states)(*state["memory"])
-        if getattr(model, "replay_buffer", None) is not None:
-            _require_like(state["buffer"], _tensors(_transitions(model.replay_buffer)), "replay buffer")
+            model._last_lstm_states = type(memory)(*state["memory"])
+        if (buffer := getattr(model, "replay_buffer", None)) is not None:
             contents = _arrays(state["buffer"])
-            for name in _transitions(model.replay_buffer):
-                setattr(model.replay_buffer, name, contents[name])
+            for name in _transitions(buffer):
+                setattr(buffer, name, contents[name])
         model.env.set_state(_arrays(state["env"]))
         actions, draws, _ = _arrays(state["random"])
         model.action_space.np_random.bit_generator.state = actions
@@ -126,50 +107,6 @@ def restore(state: Mapping[str, Any], model: Any) -> None:
         ) from error
 
 
-def _require_like(saved: Any, own: Any, name: str) -> None:
-    """Raise a ValueError if saved values have other names, types or shapes; lists of numbers may have any length."""
-    if type(saved) is not type(own):
-        raise ValueError(f"{name} is a {type(saved).__name__}, want a {type(own).__name__}")
-    if isinstance(own, torch.Tensor) and (saved.shape, saved.dtype) != (own.shape, own.dtype):
-        raise ValueError(f"{name} is {saved.dtype} {tuple(saved.shape)}, want {own.dtype} {tuple(own.shape)}")
-    if isinstance(own, Mapping):
-        if saved.keys() != own.keys():
-            raise ValueError(f"{name} has {', '.join(map(str, saved))}, want {', '.join(map(str, own))}")
-        for key in own:
-            _require_like(saved[key], own[key], f"{name}: {key}")
-    if isinstance(own, tuple):
-        for i, (part, its) in enumerate(zip(saved, own, strict=False)):
-            _require_like(part, its, f"{name}: {i}")
-
-
-def _optimizers(model: Any) -> list[torch.optim.Optimizer]:
-    parts = [attrgetter(name)(model) for name in model._get_torch_save_params()[0]]
-    return [part for part in parts if isinstance(part, torch.optim.Optimizer)]
-
-
-def _options(model: Any) -> list[Any]:
-    """Return the options of the optimizers, without the learning rate, which is set anew for each update."""
-    kept = {"params", "lr"}
-    groups = [group for optimizer in _optimizers(model) for group in optimizer.param_groups]
-    return [{key: value for key, value in group.items() if key not in kept} for group in groups]
-
-
-def _require_sound_weights(model: Any) -> None:
-    """Raise a ValueError if a weight is no number, or if an optimizer's averages do not fit its weights."""
-    for values in model.get_parameters().values():
-        if not all(v.isfinite().all() for v in values.values() if isinstance(v, torch.Tensor)):
-            raise ValueError("a weight is no number")
-    for optimizer in _optimizers(model):
-        for weight, averages in optimizer.state.items():
-            sound = averages.keys() == _ADAM and all(
-                isinstance(v, torch.Tensor) and bool(v.isfinite().all()) for v in averages.values()
-            )
-            if not sound or averages["step"].shape or averages["step"] < 1:
-                raise ValueError("an optimizer's averages are damaged")
-            if any(averages[name].shape != weight.shape for name in _ADAM - {"step"}):
-                raise ValueError("an optimizer's averages are of other weights")
-
-
 def _plain(curve: list[Row]) -> list[Row]:
     """Return evaluations with Python's numbers, each with its `steps`."""
     return [
@@ -178,12 +115,12 @@ def _plain(curve: list[Row]) -> list[Row]:
     ]
 
 
-def _numbers(model: Any) -> dict[str, Any]:
-    """Return the counters and numeric settings of a model."""
+def _counters(model: Any) -> dict[str, Any]:
+    numbers = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
     return {
         name: value.item() if isinstance(value, np.generic) else value
-        for name, value in vars(model).items()
-        if isinstance(value, (bool, int, float))
+        for name, value in numbers.items()
+        if value is not None
     }
 
 

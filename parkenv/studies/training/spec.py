@@ -12,14 +12,13 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.csv_tables import WHOLE
 from parkenv.files.limited_reading import read_json
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentItem, split_agents
 from parkenv.studies.fields import MAX_EPISODES, SCENARIOS_TAKE, Level, ScenarioList, Scenarios, Seed
-from parkenv.studies.results import PAGE, SUMMARY, CsvTable, Row, without_nan
+from parkenv.studies.results import PAGE, SUMMARY, Row, Table, without_nan
 from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.training.curve_file import CURVE, read_curve
 from parkenv.version import __version__
@@ -47,12 +46,12 @@ class _Seeds(NamedTuple):
 
     Attributes:
         folder: that of the run; a training keeps its checkpoint there.
-        shared: see `Training`.
+        shown: demonstrations to clone.
         command: command line of the run.
     """
 
     folder: Path = Path()
-    shared: Any = None
+    shown: Any = None
     command: tuple[str, ...] = ()
     columns: Row = {}  # noqa: RUF012 - never changed
 
@@ -60,9 +59,7 @@ class _Seeds(NamedTuple):
 class TrainingSpec(Study):
     """Training to search by reinforcement learning, from what is near the car, of belief and forecast."""
 
-    table: ClassVar = CsvTable(
-        "trainings.csv", ("seed",), ("steps", "wall_s"), {"seed": WHOLE, "steps": WHOLE}, lists=None
-    )
+    table: ClassVar = Table("trainings.csv", ("seed",), ("steps", "wall_s"))
     block: ClassVar = 1
     doing: ClassVar = "Training"
     table_titles: ClassVar = {
@@ -179,44 +176,40 @@ class TrainingSpec(Study):
     def prepare(self, results: Results, *, continues: bool) -> None:
         from parkenv.studies.training.training import FIGURE
 
-        results.kept["beside"] = self.training.curves_beside(results.path)
+        self.training.curves_beside(results.path)
         for outcome in (PAGE, FIGURE):
             (results.path / outcome).unlink(missing_ok=True)
         if not continues:
             for folder in results.path.glob("seed_*"):
                 shutil.rmtree(folder)
-        short = [key for key, row in results.rows(self.table).items() if row["steps"] < self.steps]
-        results.drop(short, self.table)
 
     def cells(self) -> list[Cell]:
         return [Cell(_Seeds(), range(self.seed, self.seed + self.trainings))]
 
     def stages(self, results: Results) -> Iterator[Stage]:
-        """See `Study`; the bars of the trainings follow the curves that they write."""
-        self.training.begin(results.progress)
-        with self.training.watched(results.path, self.cells()[0].items, results.progress):
-            yield Stage(self.doing, self, self.cells())
-
-    def input_of(self, work: _Seeds, items: Sequence[int], results: Results) -> _Seeds:
-        del items
-        return work._replace(folder=results.path, shared=self.training.shared, command=tuple(results.command))
+        """See `Study`; shorter trainings go on, and the bars follow the curves that trainings write."""
+        rows = results.rows(self.table).values()
+        results.replace([row for row in rows if row["steps"] >= self.steps], self.table)
+        seeds = self.cells()[0].items
+        work = _Seeds(results.path, self.training.demonstrations(results.progress), tuple(results.command))
+        with self.training.watched(results.path, seeds, results.progress):
+            yield Stage(self.doing, self, [Cell(work, seeds)])
 
     def run(self, work: _Seeds, items: Sequence[int]) -> list[Row]:
         """See `Study`; a training goes on from its checkpoint."""
         from parkenv.studies.training.training import MODEL, use_one_thread
 
         use_one_thread()
-        self.training.command, self.training.shared = work.command, work.shared
         rows: list[Row] = []
         for seed in items:
             folder = work.folder / f"seed_{seed}"
-            last = self.training.train(seed, folder)[-1]
+            last = self.training.train(seed, folder, work.shown, work.command)[-1]
             # As bytes, so that a worker on another machine can return them.
             files = {name: (folder / name).read_bytes() for name in (CURVE, MODEL)}
             rows.append({"seed": seed, "steps": int(last["steps"]), "wall_s": last["wall_s"], FILES: files})
         return rows
 
-    def keep(self, work: _Seeds, rows: Sequence[Row], results: Results) -> None:
+    def save_artifacts(self, work: _Seeds, rows: Sequence[Row], results: Results) -> None:
         """See `Study`: the model and the curve."""
         del work
         for row in rows:
@@ -228,18 +221,9 @@ class TrainingSpec(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`; the models are tested once all are trained."""
-        from parkenv.studies.training.training import FIGURE, MODEL
-
-        (seeds,) = self.cells()
-        if len(results.of(self, seeds)) < self.trainings:
+        if len(results.of(self, self.cells()[0])) < self.trainings:
             return {"rows": []}
-        folders = {seed: results.path / f"seed_{seed}" for seed in seeds.items}
-        curves = [read_curve(folder / CURVE, self.training.columns) for folder in folders.values()]
-        models = {seed: folder / MODEL for seed, folder in folders.items()}
-        summary = self.training.report(
-            results.progress, results.workers, curves, models, results.kept["beside"], results.path / FIGURE
-        )
-        return {"settings": self.settings(), **summary}
+        return {"settings": self.settings(), **self.training.report(results)}
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:

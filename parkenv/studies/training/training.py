@@ -6,7 +6,7 @@ import itertools
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 
 from parkenv.envs.sb3 import SearchVecEnv
+from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.spec_file import Several, Spec
@@ -38,19 +39,19 @@ from parkenv.studies.compare.cases import Case, rows_of
 from parkenv.studies.compare.search_replay import SearchReplay
 from parkenv.studies.fingerprints import fingerprints, flat_tables
 from parkenv.studies.report import Replay
-from parkenv.studies.results import SETTINGS, read_settings
+from parkenv.studies.results import SETTINGS, Results, read_settings
+from parkenv.studies.simulate import charge_truncation
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.study import Progress
 from parkenv.studies.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone, require_cloneable
 from parkenv.studies.training.configs import MAX_STEPS, REWARD_SCALE, SEARCH_CONFIGS, TrainingConfig
 from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_curve, require_columns
-from parkenv.studies.training.evaluation import episode_times, times_row
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.learned import LearnedAgent
-from planners.model_file import algorithm_class, save_model
+from planners.model_file import algorithm_class, save_model, slots_observed
 
 if TYPE_CHECKING:
     from parkenv.studies.training.spec import TrainingSpec
@@ -81,6 +82,8 @@ _OUTSIDE = {
 }  # fmt: skip
 """Fields of a specification that do not change its trainings, that `settings` gives in other words, or that a resumed
 training may change."""
+Times = tuple[NDArray[np.float64], NDArray[np.bool_]]
+"""Total time of each episode, s, and whether its car parked."""
 
 
 class Training:
@@ -88,18 +91,12 @@ class Training:
 
     Args:
         spec: specification of the training.
-
-    Attributes:
-        command: command line, for the model's card.
-        shared: demonstrations to clone before training; made by `begin`.
     """
 
     def __init__(self, spec: TrainingSpec) -> None:
         self.spec = spec
         self.evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + spec.evaluation_episodes)
         self.test_seeds = range(TEST_SEED, TEST_SEED + 2 * spec.evaluation_episodes)
-        self.command: tuple[str, ...] = ()
-        self.shared: Demonstrations | None = None
 
     @property
     def holds_out(self) -> bool:
@@ -173,15 +170,17 @@ class Training:
             "held_out": [world.name for world in held_out],
         }
 
-    def begin(self, progress: Progress) -> None:
-        """Record the searches of the planner to clone, which the trainings with all seeds share."""
+    def demonstrations(self, progress: Progress) -> Demonstrations | None:
+        """Record the searches of the planner to clone, if any, which the trainings with all seeds share."""
         planner = self.spec.clone
-        if planner is not None:
-            count = self.spec.demonstrations or 2000
-            seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + count)
-            progress(f"Recording searches of {planner}", 0, count)
-            self.shared = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
-            progress(f"Recording searches of {planner}", count, count)
+        if planner is None:
+            return None
+        count = self.spec.demonstrations or 2000
+        seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + count)
+        progress(f"Recording searches of {planner}", 0, count)
+        shown = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
+        progress(f"Recording searches of {planner}", count, count)
+        return shown
 
     @contextmanager
     def watched(self, out: Path, seeds: Sequence[int], progress: Progress) -> Iterator[None]:
@@ -232,7 +231,9 @@ class Training:
         if self.spec.curriculum is not None:
             env.batch.n_places = open_scenarios(len(self.sides[0]), steps / self.spec.steps)
 
-    def train(self, seed: int, folder: Path) -> list[Row]:
+    def train(
+        self, seed: int, folder: Path, shown: Demonstrations | None = None, command: Sequence[str] = ()
+    ) -> list[Row]:
         """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
 
         `model.safetensors` is the model with the best evaluation, `curve.csv` lists all evaluations. The checkpoint
@@ -242,6 +243,8 @@ class Training:
         Args:
             seed: seed of the network and of the worlds.
             folder: output folder, created if missing.
+            shown: demonstrations to clone first.
+            command: command line, for the model's card.
 
         Returns:
             The rows of `curve.csv`.
@@ -255,7 +258,7 @@ class Training:
                 f"{checkpoint}: is gone; the training cannot go on from {curve[-1]['steps']} steps"
             )
         begun = read_checkpoint(checkpoint) if checkpoint.exists() else None
-        config = self.config(begun and begun[0]["numbers"]["n_envs"])
+        config = self.config(begun and begun[0]["n_envs"])
         env, rate = self.make_env(config.n_envs), config.settings["learning_rate"]
         model = algorithm_class(self.spec.algorithm)(
             config.policy,
@@ -277,9 +280,9 @@ class Training:
             restore(state, model)
         else:
             curve = []
-            if self.shared is not None:
-                clone(model, self.shared, seed)
-        evaluator = _Evaluator(self, config, folder, curve)
+            if shown is not None:
+                clone(model, shown, seed)
+        evaluator = _Evaluator(self, config, folder, curve, command)
         left = self.spec.steps - model.num_timesteps
         if left > 0:
             model.learn(left, callback=evaluator, reset_num_timesteps=False, tb_log_name="run")
@@ -289,8 +292,8 @@ class Training:
 
     def evaluate(self, policy: Any) -> Row:
         """Run one episode in each held-out world, in the places trained on and in those held out."""
-        found = (episode_times(policy, places, self.evaluation_seeds) for places in filter(None, self.sides))
-        values = ((*mean_interval(times), float(parked.mean())) for times, parked in found)
+        runs = (episode_times(policy, places, self.evaluation_seeds) for places in filter(None, self.sides))
+        values = ((*mean_interval(times), float(parked.mean())) for times, parked in runs)
         return dict(zip(self.metrics, itertools.chain.from_iterable(values), strict=True))
 
     def description(self, config: TrainingConfig) -> dict[str, Any]:
@@ -307,31 +310,19 @@ class Training:
 
     # Testing
 
-    def report(
-        self,
-        progress: Progress,
-        workers: Workers,
-        curves: list[list[Row]],
-        models: Mapping[int, Path],
-        beside: Mapping[str, list[list[Row]]],
-        figure: Path,
-    ) -> Row:
-        """Test the models and draw the figure; return the entries of the summary.
-
-        Args:
-            progress: called as tests finish.
-            workers: where the planners search.
-            curves: rows of `curve.csv`, by training.
-            models: model files by seed.
-            beside: curves of other trainings, by name.
-            figure: file of the figure.
-        """
-        lines, planners = self._test_planners(progress, workers)
+    def report(self, results: Results) -> Row:
+        """Test the models, and draw the figure; return the entries of the summary."""
+        progress, beside = results.progress, self.curves_beside(results.path)
+        seeds = range(self.spec.seed, self.spec.seed + self.spec.trainings)
+        folders = {seed: results.path / f"seed_{seed}" for seed in seeds}
+        curves = [read_curve(folder / CURVE, self.columns) for folder in folders.values()]
+        lines, planners = self._test_planners(progress, results.workers)
         rows, transfer, places = list[Row](), list[Row](), list[Row]()
         # Of tests on either side of a split, the one on held-out places stands for the model.
         main = -1 if self.holds_out and self.spec.test_on is None else 0
-        for number, (seed, model) in enumerate(models.items()):
-            progress("Testing", number, len(models))
+        for number, (seed, folder) in enumerate(folders.items()):
+            progress("Testing", number, len(folders))
+            model = folder / MODEL
             of_model, last = {"agent": self.spec.algorithm, "seed": seed}, curves[number][-1]
             tested, by_place = self.test(model)
             transfer += [of_model | row for row in tested]
@@ -342,15 +333,15 @@ class Training:
                 "total_s_ci95": tested[main]["total_s_ci95"],
                 "steps_per_s": last["steps"] / max(last["wall_s"], 1e-9), "model": str(model),
             })  # fmt: skip
-        drawn = self._drawn(curves) | dict(beside)
-        means = {label: across_seeds(its) for label, its in drawn.items()}
-        save_learning_curves(drawn, means, lines, self._title, figure)
+        drawn = self._drawn(curves) | beside
+        means = {label: across_seeds(runs) for label, runs in drawn.items()}
+        save_learning_curves(drawn, means, lines, self._title, results.path / FIGURE)
         progress("Testing", len(rows), len(rows))
         return {
             "rows": rows, "transfer": transfer, "planners": planners, "evaluated": lines,
             **({"places": places} if places else {}),
             "curve": across_seeds(curves),
-            "beside": {name: across_seeds(its) for name, its in beside.items()},
+            "beside": {name: across_seeds(runs) for name, runs in beside.items()},
         }  # fmt: skip
 
     def _test_planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
@@ -404,8 +395,8 @@ class Training:
             beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
             cases.append((Case(scenario, f"{self.spec.algorithm}:{model}"), seeds))
             compared = (Case(scenario, agent.name, options=agent.options) for agent in self.compared)
-            made = {case.label: case for case in compared}
-            cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
+            by_label = {case.label: case for case in compared}
+            cases += [(by_label[row["agent"]], seeds) for row in beside if row["agent"] in by_label]
         return [SearchReplay(cases, folder)]
 
     @property
@@ -442,17 +433,16 @@ class Training:
                 raise InputError(f"--beside: {folder} is already drawn")
             known.add(os.path.realpath(folder))
             settings = read_settings(folder)
-            curves = [read_curve(its, columns) for its in sorted(folder.glob(f"seed_*/{CURVE}"))]
+            curves = [read_curve(file, columns) for file in sorted(folder.glob(f"seed_*/{CURVE}"))]
             curves = [curve for curve in curves if curve]
             if settings is None or not curves or "algorithm" not in settings:
                 raise InputError(f"--beside: {folder} holds no training")
             label = name_of(settings, str(folder / SETTINGS))
             for name in EVALUATED_BY:
-                theirs, ours = settings.get(name), own.get(name)
-                if theirs != ours:
+                if settings.get(name) != own.get(name):
                     raise InputError(
-                        f"--beside: {name} is {theirs!r} in {folder} and {ours!r} here; their evaluations cannot be "
-                        "compared"
+                        f"--beside: {name} is {settings.get(name)!r} in {folder} and {own.get(name)!r} here; their "
+                        "evaluations cannot be compared"
                     )
             if label == name_of(own) or label in beside:
                 label = f"{label} ({folder})"
@@ -463,9 +453,17 @@ class Training:
 class _Evaluator(BaseCallback):  # type: ignore[misc]
     """Callback that evaluates and saves the model during training."""
 
-    def __init__(self, training: Training, config: TrainingConfig, folder: Path, curve: list[Row]) -> None:
+    def __init__(
+        self,
+        training: Training,
+        config: TrainingConfig,
+        folder: Path,
+        curve: list[Row],
+        command: Sequence[str],
+    ) -> None:
         super().__init__()
         self.subject, self.config, self.folder, self.curve = training, config, folder, curve
+        self.command = command
         self._start = time.monotonic() - (curve[-1]["wall_s"] if curve else 0.0)
         self._due = self._due_after(curve[-1]["steps"] if curve else 0)
 
@@ -491,11 +489,53 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         self.curve.append({"steps": model.num_timesteps, **scores, "wall_s": time.monotonic() - self._start})
         if scores["total_s"] <= best:
             described = self.subject.description(self.config)
-            save_model(model, self.folder / MODEL, results=scores, command=self.subject.command, **described)
+            save_model(model, self.folder / MODEL, results=scores, command=self.command, **described)
         write_csv(self.folder / CURVE, list(self.curve[0]), self.curve)
         # Last: a training that is killed before this line repeats what it has just done.
         save_checkpoint(self.folder / CHECKPOINT, model, self.curve)
         return scores
+
+
+def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
+    """Return the total times of episodes as columns of `parkenv compare`."""
+    mean, low, high = mean_interval(times)
+    return {
+        "episodes": len(times),
+        "parked_fraction": float(parked.mean()),
+        "total_s": mean,
+        "total_s_ci95": [low, high],
+    }
+
+
+def episode_times(model: Any, places: Scenario | Sequence[Scenario], seeds: Sequence[int]) -> Times:
+    """Run episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
+
+    An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
+
+    Args:
+        model: a stable-baselines3 or sb3-contrib model of the `local` observation.
+        places: scenario to search in; or several, of which each seed draws one.
+        seeds: one episode each.
+    """
+    n = len(seeds)
+    k = slots_observed(model.observation_space)
+    batch = ParkSearchVectorEnv(n, places, "local", k, MAX_STEPS)
+    seen, _ = batch.reset(seed=list(seeds))
+    give_up_s = np.array([scenario.give_up_s for scenario in batch.scenarios])[batch.place_of]
+    times, parked = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
+    state, start = None, np.ones(n, dtype=np.bool_)
+    masked = "action_masks" in model.predict.__code__.co_varnames
+    while np.isnan(times).any():
+        masks = {"action_masks": seen["action_mask"]} if masked else {}
+        actions, state = model.predict(seen, state=state, episode_start=start, deterministic=True, **masks)
+        seen, _, terminated, truncated, info = batch.step(actions)
+        start = terminated | truncated
+        first = start & np.isnan(times)
+        if first.any():
+            charge_truncation(info, give_up_s, truncated & ~terminated)
+            times[first] = info["total_s"][first]
+            parked[first] = info["parked"][first]
+    return times, parked
 
 
 def use_one_thread() -> None:
@@ -518,10 +558,10 @@ class _Naming(Spec, extra="ignore"):
 
 def name_of(settings: Row, source: str = "settings") -> str:
     """Return the name of a training in a figure with others."""
-    its = _Naming.parse(settings, source)
-    scenarios = its.scenario or ()
-    name = its.algorithm + (f" on {', '.join(scenarios)}" if len(scenarios) > 1 else "")
-    return f"{name} after cloning {its.clone}" if its.clone else name
+    naming = _Naming.parse(settings, source)
+    scenarios = naming.scenario or ()
+    name = naming.algorithm + (f" on {', '.join(scenarios)}" if len(scenarios) > 1 else "")
+    return f"{name} after cloning {naming.clone}" if naming.clone else name
 
 
 def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> None:

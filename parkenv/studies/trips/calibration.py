@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import TypeAdapter
 from scipy import stats
 
 from parkenv.compiled.arrays import FloatArray
@@ -21,12 +20,10 @@ from parkenv.scenarios.calibration import Calibration
 from parkenv.show.figures.picture_files import INK, picture
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of, mean_interval
-from parkenv.studies.trips.calibration_study import OBSERVED, UNOBSERVED
+from parkenv.studies.trips.calibration_study import OBSERVED
 from parkenv.studies.trips.driven_car import EDGE_KINDS, Leg, ParkingAttempt
 from parkenv.studies.trips.driven_search import Trip
 from parkenv.world.scenario import KMH, Scenario
-
-_TRIP = TypeAdapter(Trip)
 
 
 def trip_row(trip: Trip, slots: str) -> Row:
@@ -38,19 +35,6 @@ def trip_row(trip: Trip, slots: str) -> Row:
         "legs": [list(leg) for leg in trip.legs],
         "attempts": [list(t) for t in trip.attempts],
     }
-
-
-def trip_of_row(row: Row) -> Row:
-    """Return a row of `trip_row` that was read from a file.
-
-    Raises:
-        ValueError, KeyError: it is not a trip record.
-    """
-    fields = dict(row)
-    slots = fields.pop("slots")
-    if slots not in (OBSERVED, UNOBSERVED):
-        raise ValueError(slots)
-    return {"slots": slots, **dataclasses.asdict(_TRIP.validate_python(fields))}
 
 
 def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:

@@ -15,7 +15,7 @@ from parkenv.files.option import option
 from parkenv.scenarios.spec import Speed, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, Vehicle, require_rig
-from parkenv.studies.results import JsonTable, Results, Row
+from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
 
@@ -42,12 +42,6 @@ class _Trips(NamedTuple):
         return {"slots": self.slots}
 
 
-def _trip(row: Row) -> Row:
-    from parkenv.studies.trips.calibration import trip_of_row
-
-    return trip_of_row(row)
-
-
 class CalibrationStudy(Study):
     """Driven trips that measure the driving speed and the cost of a failed attempt of the drive graph.
 
@@ -55,7 +49,7 @@ class CalibrationStudy(Study):
     provide failed attempts.
     """
 
-    table: ClassVar = JsonTable("trips.jsonl", ("slots", "seed"), _trip, "trip")
+    table: ClassVar = Table("trips.jsonl", ("slots", "seed"))
     block: ClassVar = 5
     doing: ClassVar = "Driving"
     unit: ClassVar = "trips"

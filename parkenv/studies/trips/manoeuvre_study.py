@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 from pydantic import BeforeValidator, Field, ValidationInfo
 
 from parkenv.errors import InputError
-from parkenv.files.csv_tables import NUMBER_OR_NOTHING, TEXT, WHOLE, YES_OR_NO
 from parkenv.files.known_names import SCENE_LEVELS
 from parkenv.files.option import option
 from parkenv.studies.fields import Figures, SceneLevels, Seed, Vehicle, levels_in
 from parkenv.studies.fingerprints import fingerprints
-from parkenv.studies.results import CsvTable, LongTable, Results, Row
+from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.study import Cell, Study
 from parkenv.version import __version__
 
@@ -28,32 +27,18 @@ if TYPE_CHECKING:
     from parkenv.studies.workers import Task
     from planners.driving.manoeuvre import Manoeuvre
 
-MANOEUVRES = CsvTable(
+_SCENE = ("agent", "case")
+MANOEUVRES = Table(
     "manoeuvres.csv",
-    ("agent", "case"),
+    _SCENE,
     (
         "planned", "driven", "contact", "clearance_m", "error_m", "error_rad", "time_s", "length_m",
         "direction_changes", "planning_s",
     ),
-    dict.fromkeys(("planned", "driven", "contact"), YES_OR_NO)
-    | {"agent": TEXT, "case": TEXT, "direction_changes": WHOLE},
-    other=NUMBER_OR_NOTHING,
-    lists=None,
 )  # fmt: skip
-TRAJECTORIES = LongTable(
-    "trajectories.csv",
-    ("agent", "case"),
-    ("time_s",),
-    ("x_m", "y_m", "yaw_rad", "speed_mps", "steering_rad"),
-    {"agent": TEXT, "case": TEXT},
-)
-ROAD_USERS = LongTable(
-    "road_users.csv",
-    ("agent", "case"),
-    ("time_s", "user"),
-    ("x_m", "y_m", "yaw_rad"),
-    {"agent": TEXT, "case": TEXT, "user": WHOLE},
-)
+_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "steering_rad")
+TRAJECTORIES = Table("trajectories.csv", _SCENE, ("time_s", *_STATE), long=True)
+ROAD_USERS = Table("road_users.csv", _SCENE, ("time_s", "user", *_STATE[:3]), long=True)
 SHEET = 12
 """Greatest number of scenes on a picture."""
 
@@ -73,11 +58,10 @@ class ManoeuvreStudy(Study):
     """Scenes of manoeuvres, each planned, driven with the vehicle's limits and rates, and judged by its footprints."""
 
     table: ClassVar = MANOEUVRES
-    all_tables: ClassVar = (MANOEUVRES, TRAJECTORIES, ROAD_USERS)
+    further_tables: ClassVar = (TRAJECTORIES, ROAD_USERS)
     block: ClassVar = 4
     doing: ClassVar = "Parking"
     unit: ClassVar = "scenes"
-    goes_on: ClassVar = "unfinished"
     heading: ClassVar = "Manoeuvres"
 
     kind: Literal["park"] = "park"
@@ -161,14 +145,7 @@ class ManoeuvreStudy(Study):
         made = {name: park(self.scene(name)) for name in items}
         if self.shorten_s > 0.0:
             made = {name: shorten(each, self.shorten_s) for name, each in made.items()}
-        return [work.columns | manoeuvre_row(name, each) for name, each in made.items()]
-
-    def keep(self, work: _Planned, rows: Sequence[Row], results: Results) -> None:
-        """See `Study`: what was driven."""
-        for table, name in ((TRAJECTORIES, "states"), (ROAD_USERS, "others")):
-            results.add(
-                [work.columns | {"case": row["case"], **row[name]} for row in rows if row[name]], table
-            )
+        return [manoeuvre_row(work.columns | {"case": name}, each) for name, each in made.items()]
 
     def summarise(self, results: Results) -> Row:
         rows = [row for cell in self.cells() for row in results.of(self, cell)]
@@ -229,31 +206,29 @@ class ManoeuvreStudy(Study):
         return "no path" if not row["planned"] else "contact" if row["contact"] else "not at the target"
 
 
-def manoeuvre_row(name: str, made: Manoeuvre) -> Row:
-    """Return the row of a manoeuvre, with `states` and `others`, the lines of its trajectory and of road users.
-
-    They are in the frame of its file.
-    """
+def manoeuvre_row(keys: Row, made: Manoeuvre) -> Row:
+    """Return the row of a manoeuvre, with those of its trajectory and of road users, in the frame of its file."""
     from parkenv.driving.vehicle import PHYSICS_S
 
-    lines = made.states[:, : len(TRAJECTORIES.columns)].round(7)
+    lines = made.states[:, : len(_STATE)].round(7)
     lines[:, :2] += made.scene.origin
-    time, others = [round(PHYSICS_S * i, 2) for i in range(len(lines))], Row()
+    time, others = [round(PHYSICS_S * i, 2) for i in range(len(lines))], dict[str, Row]()
     if made.others is not None:
         users, n = made.others.round(7).reshape(-1, 3), made.others.shape[1]
         users[:, :2] += made.scene.origin
-        others = {"time_s": [at for at in time for _ in range(n)], "user": list(range(n)) * len(time)}
-        others |= dict(zip(ROAD_USERS.columns, users.T.tolist(), strict=True))
+        named = {"time_s": [at for at in time for _ in range(n)], "user": list(range(n)) * len(time)}
+        named |= dict(zip(_STATE[:3], users.T.tolist(), strict=True))
+        others[ROAD_USERS.file] = keys | named
     return {
-        "case": name,
+        **keys,
         "planned": made.path is not None,
         **made.judged._asdict(),
         "time_s": made.time_s,
         "length_m": made.length_m,
         "direction_changes": made.direction_changes,
         "planning_s": made.planning_s,
-        "states": {"time_s": time, **dict(zip(TRAJECTORIES.columns, lines.T.tolist(), strict=True))},
-        "others": others,
+        TRAJECTORIES.file: {**keys, "time_s": time, **dict(zip(_STATE, lines.T.tolist(), strict=True))},
+        **others,
     }
 
 
