@@ -1,6 +1,7 @@
 """Commute: a map that learns over days, resumed and reported."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,9 +95,9 @@ def test_a_resumed_commute_equals_an_unbroken_one(tmp_path):
 def test_days_do_not_depend_on_later_ones():
     course = CommuteRun(make_scenario("mini"), AgentSpec(name="belief"), "wrong", 0, 2, 5)
     days = calendar(course.scenario, 6)
-    rows, first = course.run(days, []), course.run(days[:3], [])
+    rows, first = course.run(days), course.run(days[:3])
     trips = sorted((row[TRIP] for row in first), key=lambda trip: (trip.time, trip.key))
-    rest = course.run(days[3:], trips)
+    rest = replace(course, before=trips).run(days[3:])
     measured = (TRIP, DECISIONS)
     for row, other in zip(rows, first + rest, strict=True):
         assert {**row, **dict.fromkeys(measured)} == {**other, **dict.fromkeys(measured)}
@@ -121,7 +122,7 @@ def test_drivers_come_on_the_next_weekdays_or_recorded_days(tmp_path):
         (8, dates[3]),
         (9, dates[4]),
     ]
-    rows = CommuteRun(recorded, AgentSpec(name="first-free"), "none", 0, 1, 0).run(days, [])
+    rows = CommuteRun(recorded, AgentSpec(name="first-free"), "none", 0, 1, 0).run(days)
     assert [row["day"] for row in rows] == [day.date for day in days]
 
 
@@ -145,7 +146,7 @@ def test_a_week_of_trips_closes_the_gap_of_a_wrong_map(monkeypatch):
 
     def total_s(agent, start):
         courses = [CommuteRun(scenario, AgentSpec(name=agent), start, number, 1, 0) for number in range(12)]
-        return np.array([[row["total_s"] for row in course.run(days, [])] for course in courses])
+        return np.array([[row["total_s"] for row in course.run(days)] for course in courses])
 
     learning, right = (total_s("belief", start) for start in ("wrong", "fixed"))
     without = total_s("greedy-drive", "none")
