@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.belief.day_belief import DOUBT, EVENT, DayBelief
 from parkenv.belief.slot_belief import UNOBSERVED, Observations, SlotBelief
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import require_number
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import nearness
@@ -24,11 +24,12 @@ from planners.agent import (
     belief_for_decision,
     require_observations,
 )
-from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path
+from planners.belief.best_path import ATTEMPT, NOWHERE, best_path
+from planners.belief.path import Budget, Course
 from planners.belief.planning_graph import (
     SLOT,
     BeliefSnapshot,
-    PathBuffers,
+    PathBuffer,
     PlanningGraph,
     path_buffers,
     set_slots,
@@ -49,6 +50,7 @@ may have been the last one for a long time.
 ROWS = 40  # of the table of drives of a part that are computed at each decision on the way there: some 3 ms
 STALE_S = 60.0  # s without a newly observed slot after which the search moves on to another part of the lot
 PREVIEW_S = 60.0  # s, horizon of the plan preview
+_NO_COURSE = Course(np.zeros(0, np.int64), -1, math.nan)
 
 
 class Crowd(NamedTuple):
@@ -81,14 +83,12 @@ class BeliefSearch:
     time: float  # s since the search began, at the last decision
     # s, the last time at which an unobserved slot of the part was observed, or the part was chosen
     news_at: float
-    # (k,) int64, the vertices that the path of the last decision passes first; up to `DEPTH`
-    targets: IntArray
-    heading: int  # without these, the slot that the path drives to first; -1: it has just been observed
-    paths: PathBuffers  # buffers of the path search
+    paths: PathBuffer  # buffers of the path search
     # what was observed before this decision, step by step; empty if the part is the whole lot
     past: list[Observations]
     entry: int = -1  # vertex to drive to before planning, or -1
-    failure_s: float = math.nan  # s, failure cost of the thesis's planner on that path; nan if there was none
+    # that of the path of the last decision, of up to `DEPTH` targets; its failure cost is nan if there was none
+    course: Course = _NO_COURSE
     # s, time that was expected to remain on that path by now; inf if something has been observed since
     remaining_s: float = math.inf
     replans: int = 0  # number of times that the path ahead has changed
@@ -103,7 +103,10 @@ class BeliefSearch:
 
     def leave_path(self) -> None:
         """Give up the path of the last decision: the car has taken another way."""
-        self.targets, self.heading, self.remaining_s = self.targets[:0], -1, math.inf
+        self.course, self.remaining_s = (
+            self.course._replace(targets=self.course.targets[:0], heading=-1),
+            math.inf,
+        )
 
 
 class BeliefAgent(SearchAgent[BeliefSearch]):
@@ -211,8 +214,6 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             missed_rate=np.zeros(n),
             time=belief.time,
             news_at=belief.time,
-            targets=np.zeros(0, dtype=np.int64),
-            heading=-1,
             paths=path_buffers(len(FAILURE_COSTS) + 1, n, len(near.vertices)),
             past=[],
         )
@@ -270,11 +271,12 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         first = np.flatnonzero((state != UNOBSERVED) & (memory.state == UNOBSERVED))
         if len(first):
             memory.news_at = belief.time
-        if (state != memory.state).any():
-            memory.remaining_s, memory.heading = math.inf, -1
+        changed = (state != memory.state).any()
+        if changed:
+            memory.remaining_s = math.inf
+        if changed or memory.course.heading in known.observations.slots:
+            memory.course = memory.course._replace(heading=-1)
         memory.state = state
-        if memory.heading in known.observations.slots:
-            memory.heading = -1
         here = near.index(vertex)
         if belief.time > memory.time:
             memory.day.update(known.observations)
@@ -292,34 +294,27 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         self, vertex: int, here: int, known: SlotBelief, memory: BeliefSearch
     ) -> int | None:
         """Return the first action of the best path, or None where there is no path."""
-        near = memory.near
-        choice = best_path(
-            here,
-            memory.targets,
-            memory.heading,
-            memory.failure_s,
-            memory.remaining_s,
-            self._budget,
-            self._planning_graph(memory),
-            snapshot(here, known, memory),
-            memory.paths,
+        near, last = memory.near, memory.course
+        graph, belief = self._planning_graph(memory), snapshot(here, known, memory)
+        choice = best_path(here, last, memory.remaining_s, self._budget, graph, belief, memory.paths)
+        memory.course, (onward_s, remaining_s, following) = choice.course, choice.path
+        is_same = memory.course.failure_s == last.failure_s and np.array_equal(
+            memory.course.targets, last.targets
         )
-        kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
-        memory.replans += not (kept or math.isnan(memory.failure_s))
-        memory.targets, memory.heading, memory.failure_s = choice.targets, choice.heading, choice.failure_s
+        memory.replans += not (is_same or math.isnan(last.failure_s))
         # A path that has had its time is given up for a new plan.
-        memory.remaining_s = choice.remaining_s if choice.remaining_s > 0.0 else math.inf
-        memory.expected_s = min(choice.onward_s, choice.at_hand_s)
-        if choice.slot >= 0 and choice.at_hand_s <= choice.onward_s + self._worth_passing_s:
+        memory.remaining_s = remaining_s if remaining_s > 0.0 else math.inf
+        memory.expected_s = min(onward_s, choice.at_hand_s)
+        if choice.slot >= 0 and choice.at_hand_s <= onward_s + self._worth_passing_s:
             memory.remaining_s = math.inf
             return PARK if choice.slot == here else near.table.move(here, choice.slot)
-        if choice.next_vertex == ATTEMPT:
+        if following == ATTEMPT:
             return PARK
-        if choice.next_vertex == NOWHERE:
+        if following == NOWHERE:
             return None
-        if choice.next_vertex == here:
+        if following == here:
             return self.wait(vertex)
-        return near.table.move_to(here, choice.next_vertex)
+        return near.table.move_to(here, following)
 
     def _change_part(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
         """Change the planned part of the lot to the one around the car; keep what is known about it."""
@@ -333,7 +328,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         added = np.where(np.isin(near.slots, old.slots), -1, near.slots)
         for observations in new.past:
             new.day.update(observations.take(added))
-        new.failure_s, new.replans = memory.failure_s, memory.replans
+        new.course, new.replans = new.course._replace(failure_s=memory.course.failure_s), memory.replans
         # Update in place: the caller keeps `memory`.
         vars(memory).update(vars(new))
         memory.entry = -1 if near.entry == vertex else near.entry

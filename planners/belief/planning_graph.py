@@ -88,6 +88,23 @@ OBSERVATION = np.dtype(
 )
 """An observation of a slot along a path."""
 
+STATE = np.dtype(
+    [
+        ("n_stops", np.int64),
+        ("left_s", np.float64),  # expected time after the last stop if nothing was found
+        # of the rollout so far: where the car is, and when; the vertex that it drives to
+        ("vertex", np.int64),
+        ("time", np.float64),
+        ("target", np.int64),
+        ("chooses", np.bool_),  # whether the thesis's planner chooses another target
+        ("n_passed", np.int64),  # number of the given targets that it has passed
+        ("n_observations", np.int64),
+        ("n_unproven", np.int64),  # number of slots to observe taken before the lot is proven full
+        ("n_unobserved", np.int64),  # number of slots within reach that were never observed
+    ]
+)
+"""A path as a whole."""
+
 REMEMBERED = np.dtype(
     [
         ("slot", np.int64),
@@ -167,8 +184,9 @@ def _rate_of_return(leaving: float, usual: float, weights: FloatArray, p_free_if
 
 
 class PathBuffer(NamedTuple):
-    """Buffer for one path."""
+    """Buffer for one path; with a further leading axis of the first three arrays, for several that share the rest."""
 
+    state: Records  # (1,) `STATE` record
     stops: Records  # `STOP` records, one more than there are stops
     observations: Records  # `OBSERVATION` records in order
     marks: Records  # (n_slots,) `MARK` records
@@ -176,28 +194,16 @@ class PathBuffer(NamedTuple):
     remembered: Records  # `REMEMBERED` records, scratch, in the order of the observations
     # float64, s, scratch: expected times from each stop to the slots in mind, or to the best of those known before
     kept_s: FloatArray
-    value_s: (
-        FloatArray  # float64, s, scratch: value at a stop of what follows with each of `remembered` in mind
-    )
-
-
-class PathBuffers(NamedTuple):
-    """Buffers for several paths that are kept during a decision; fields as in `PathBuffer`."""
-
-    stops: Records  # (n_paths, ...)
-    observations: Records  # (n_paths, ...)
-    marks: Records
-    weights: FloatArray
-    remembered: Records
-    kept_s: FloatArray
+    # float64, s, scratch: value at a stop of what follows with each of `remembered` in mind
     value_s: FloatArray
 
 
-def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffers:
+def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffer:
     """Allocate the buffers for paths on a lot of a given size."""
     most_stops = min(4 * n_vertices + 16, MOST_STOPS)
     most_observations = n_slots + min(n_slots + 64, MOST_STOPS)
-    return PathBuffers(
+    return PathBuffer(
+        np.zeros((n_paths, 1), STATE),
         np.zeros((n_paths, most_stops + 1), STOP),
         np.zeros((n_paths, most_observations), OBSERVATION),
         np.zeros(n_slots, MARK),

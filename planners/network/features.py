@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from planners.belief.path_evaluation import expected_cost_to_slot, options_at_hand
+from planners.belief.path import expected_cost_to_slot, options_at_hand
 from planners.belief.planning_graph import BeliefSnapshot, PlanningGraph, is_hidden, needs_attempt
 from planners.network.lookahead import Scratch, best_option, next_target, path_value
 

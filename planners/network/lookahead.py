@@ -14,8 +14,7 @@ import numpy as np
 from parkenv.belief.slot_belief import OBSERVED_FREE, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from planners.belief.path_evaluation import expected_cost_to_slot
-from planners.belief.path_rollout import p_free_again
+from planners.belief.path import expected_cost_to_slot, p_free_again
 from planners.belief.planning_graph import BeliefSnapshot, PlanningGraph, is_hidden
 
 MOST_STOPS = 48  # maximum number of vertices of a path
