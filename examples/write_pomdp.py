@@ -19,9 +19,8 @@ import parkenv
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.day_error import EXACT, DayError
-from planners.bounds.days import Days
-from planners.bounds.exact import ExactSolution
-from planners.road_table import RoadTable
+from planners.bounds.exact import Days, ExactSolution
+from planners.routes import RoadTable
 
 SCENARIO, SEED, DISCOUNT = "mini", 0, 1.0
 FILE = Path("mini.pomdp")

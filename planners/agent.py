@@ -176,7 +176,7 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
         if before == HUMAN:
             recorded: Agent = import_module("planners.human").HumanAgent(scenario, after)
             return recorded
-        learned: Agent = import_module("planners.learned").LearnedAgent(scenario, before, after)
+        learned: Agent = import_module("planners.model_file").LearnedAgent(scenario, before, after)
         return learned
     if colon and before == NETWORK:
         options, name, colon = {"weights": after, **options}, NETWORK, ""

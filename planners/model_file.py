@@ -1,33 +1,39 @@
 """Model files: a policy's weights and its card in one safetensors file, which runs no code when it is opened.
 
-The card is JSON in the file's metadata. It holds what is needed to build the policy again, and what the model was
-trained on. Archives that stable-baselines3 writes itself hold pickled Python objects, which run code; see
+The file begins with the length of the header, 8 bytes, little-endian, and the header, JSON; the tensors follow. The
+card is JSON in the header's metadata. It holds what is needed to build the policy again, and what the model was trained
+on. Archives that stable-baselines3 writes itself hold pickled Python objects, which run code; see
 `convert_archive`.
 """
 
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 from pydantic import Field, JsonValue, model_validator
 from pydantic_core import to_jsonable_python
 
 from parkenv.errors import InputError, with_extra
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.limited_reading import read_bytes
+from parkenv.files.limited_reading import parse_json, read_bytes
 from parkenv.files.spec_file import Several, Spec
 from parkenv.version import __version__
 from parkenv.world.lot import ACTIONS
-from planners.model_header import CARD_KEY, read_header
+from parkenv.world.scenario import SearchProblem
 from planners.names import ALGORITHMS
 
 SUFFIX = ".safetensors"
+CARD_KEY = "parkenv"
+"""Key of the card in the metadata."""
+_MAX_HEADER = 1_000_000
 OBSERVATION = "local-1"
 """Version of the layout of `parkenv.engine.local_observation`, which search models observe."""
 FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
@@ -39,6 +45,30 @@ _ZIP = b"PK"
 # Bounds, so that a card cannot ask for more memory than a network of a few million weights needs.
 Width = Annotated[int, Field(ge=1, le=1024)]
 Layers = Annotated[Several[Width], Field(max_length=8)]
+
+
+class ModelHeader(NamedTuple):
+    """Header of a model file."""
+
+    card: dict[str, Any]  # content of the card, not yet validated
+    tensors: dict[str, Any]  # entries with dtype, shape and data_offsets by name, not yet validated
+    body: memoryview  # the tensors
+
+
+def read_header(data: bytes, path: str | os.PathLike[str]) -> ModelHeader:
+    """Read the header of the content of a model file."""
+    size = int.from_bytes(data[:8], "little")
+    if data[8:9] != b"{" or size > min(_MAX_HEADER, len(data) - 8):
+        raise InputError(f"{path}: no model file, or a damaged one")
+    header = parse_json(data[8 : 8 + size], f"{path}: header")
+    metadata = header.pop("__metadata__", None)
+    text = metadata.get(CARD_KEY) if isinstance(metadata, dict) else None
+    if not isinstance(text, str):
+        raise InputError(f"{path}: no model of `parkenv train`: it has no card")
+    card = parse_json(text, f"{path}: card")
+    if not isinstance(card, dict):
+        raise InputError(f"{path}: card is a {type(card).__name__}, want a JSON object")
+    return ModelHeader(card, header, memoryview(data)[8 + size :])
 
 
 class BoxSpace(Spec):
@@ -294,3 +324,54 @@ def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:
         raise InputError(f"{path}: no archive of {algorithm} ({type(error).__name__}: {error})") from error
     save_model(model, made)
     return made
+
+
+class LearnedAgent:
+    """A trained model as an agent, on `parkenv.engine.local_observation`.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        algorithm: algorithm that it was trained with.
+        path: the model file.
+
+    Attributes:
+        card: metadata of the file.
+        model: the policy.
+        local_k: number of slots in the observation.
+    """
+
+    def __init__(self, problem: SearchProblem, algorithm: str, path: str | os.PathLike[str]) -> None:
+        self.name = f"{algorithm}:{path}"
+        self.problem = problem.public()
+        self.card, self.model = load_model(algorithm, path)
+        lots = self.card.scenarios
+        if lots and not {problem.lot.name, getattr(problem, "name", "")} & {*lots, *self.card.held_out}:
+            named = ", ".join(lots[:3]) + (f" and {len(lots) - 3} more" if len(lots) > 3 else "")
+            warnings.warn(f"{path}: was trained on {named}, not on {problem.lot.name}", stacklevel=2)
+        self.local_k = self.card.k
+
+    def predict(
+        self,
+        observation: Mapping[str, NDArray[Any]],
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Any, Any]:
+        """Choose an action for an observation of `LocalObservation`, as stable-baselines3 does."""
+        if "local" not in observation:
+            raise InputError(
+                f"{self.name} wants observations of parkenv.envs.local_observation.LocalObservation, "
+                f"got {', '.join(observation)}"
+            )
+        given, wanted = observation["local"].shape[-1:], self.model.observation_space["local"].shape
+        if given != wanted:
+            raise InputError(
+                f"{self.name} observes {wanted[0]} numbers, got {given[0]} for its k = {self.card.k}"
+            )
+        if not np.any(observation["action_mask"], axis=-1).all():
+            raise InputError("action_mask allows nothing; a search that goes on allows at least one action")
+        masks = {"action_masks": observation["action_mask"]} if self.card.algorithm == "maskable-ppo" else {}
+        action, state = self.model.predict(
+            dict(observation), state=state, episode_start=episode_start, deterministic=deterministic, **masks
+        )
+        return action, state

@@ -16,7 +16,7 @@ from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.sensor_model import SensorRates
 from planners.belief.planning_graph import VIEW, PlanningGraph
-from planners.road_table import RoadTable
+from planners.routes import RoadTable
 from planners.thesis.label_setting import StoppingGraph, set_labels
 from planners.thesis.mdp import ParkingMDP
 

@@ -8,7 +8,7 @@ import numpy as np
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import EXACT
-from planners.bounds.days import Days
+from planners.bounds.exact import Days
 
 MOST_STEPS = 2000  # decisions after which a search is truncated at a cost of `give_up_s`, as in comparisons
 

@@ -322,7 +322,7 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
         "the places trained on decide which model is kept"
     )
     # The mean over drawn places, each with its own give-up penalty, is that of the searches one by one.
-    from planners.learned import LearnedAgent
+    from planners.model_file import LearnedAgent
 
     agent = LearnedAgent(PLACES[0], "ppo", tmp_path / "model.safetensors")
     seeds = range(2_000_000, 2_000_012)

@@ -9,7 +9,7 @@ from parkenv.studies.runner import run
 from parkenv.studies.training.configs import SEARCH_CONFIGS
 from parkenv.studies.training.spec import TrainingSpec
 from parkenv.studies.training.training import episode_times
-from planners.learned import LearnedAgent
+from planners.model_file import LearnedAgent
 
 PLACES = [make_scenario("mini"), make_scenario("campus")]
 LOTS = [make_scenario(grid_lot(2, 6 + i), name=f"lot{i}") for i in range(6)]

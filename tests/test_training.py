@@ -35,8 +35,7 @@ from parkenv.studies.training.training import TRAINING_SEEDS, Training, episode_
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
 from planners.agent import make_agent
-from planners.learned import LearnedAgent
-from planners.model_file import FIXED_NUMBERS, NUMBERS_PER_SLOT, save_model
+from planners.model_file import FIXED_NUMBERS, NUMBERS_PER_SLOT, LearnedAgent, save_model
 from planners.names import ALGORITHMS
 
 _MINI = make_scenario("mini")

@@ -32,8 +32,8 @@ from parkenv.studies.trips.vehicle_controller import VehicleController
 from parkenv.world.lot_scene import LotScenes
 from parkenv.world.traffic import Traffic
 from planners.agent import make_agent
-from planners.driving.lane_keeping import LaneKeeper, rounded
-from planners.driving.path_tracking import TrackingSettings
+from planners.driving.car_path import rounded
+from planners.driving.path_tracking import LaneKeeper, TrackingSettings
 from sim_sensors.rig import SensorRig
 
 CAR = VehicleParameters()

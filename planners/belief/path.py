@@ -102,15 +102,14 @@ def rollout_path(course: Course, search: Search, path: PathBuffer) -> None:
 def _start(heading: int, search: Search, path: PathBuffer) -> None:
     graph, belief, state, stops = search.graph, search.belief, path.state[0], path.stops
     # A part of a lot can never be proven full: count one more unobserved slot.
-    state.n_unproven = 0 if graph.whole else 1
-    state.n_unobserved = 0 if graph.whole else len(belief.slots)
+    n_unproven, n_unobserved = (0, 0) if graph.whole else (1, len(belief.slots))
+    drive_s = graph.drive_s[search.vertex]
     for s in range(len(belief.slots)):
         observed = belief.slots[s].state
         path.marks[s].observed_at = -np.inf if observed == OBSERVED_FREE else -1.0
-        if observed == UNOBSERVED and graph.drive_s[search.vertex, s] < np.inf:
-            state.n_unobserved += 1
-        if observed != OBSERVED_TAKEN:
-            state.n_unproven += 1
+        n_unobserved += observed == UNOBSERVED and drive_s[s] < np.inf
+        n_unproven += observed != OBSERVED_TAKEN
+    state.n_unproven, state.n_unobserved = n_unproven, n_unobserved
     stops[0].vertex, stops[0].time, stops[0].first, stops[1].first = search.vertex, 0.0, 0, 0
     state.vertex, state.time, state.n_stops, state.n_observations, state.n_passed = (
         search.vertex,
@@ -204,16 +203,22 @@ def _drive(search: Search, path: PathBuffer) -> None:
 def _observe_here(search: Search, path: PathBuffer) -> None:
     """Add the observations from the last stop, and the result of an attempt if they do not show the target."""
     state, graph, belief = path.state[0], search.graph, search.belief
-    vertex, time = state.vertex, state.time
+    vertex, time, target, n_observations, n_first = (
+        state.vertex,
+        state.time,
+        state.target,
+        state.n_observations,
+        0,
+    )
     weights = path.weights[: len(belief.weights)]
     n_views = graph.view_starts[vertex + 1] - graph.view_starts[vertex]
     for i in range(n_views + 1):
-        if state.n_observations == len(path.observations):
+        if n_observations == len(path.observations):
             break
         attempts = i == n_views
         if attempts:
             s = vertex
-            if vertex != state.target or not _is_attempt_due(graph, belief, path):
+            if vertex != target or not _is_attempt_due(graph, belief, path):
                 continue
         else:
             view = graph.views[graph.view_starts[vertex] + i]
@@ -226,13 +231,12 @@ def _observe_here(search: Search, path: PathBuffer) -> None:
         is_first = belief.slots[s].state == UNOBSERVED and path.marks[s].observed_at < 0.0
         if is_first:
             p_free = p_free_when_first_observed(weights, belief.p_free_if[s], True)
-            state.n_unproven -= 1
-            state.n_unobserved -= 1
+            n_first += 1
         else:
             p_free = p_free_again(s, time, path.marks[s].observed_at, belief)
             if p_free == 0.0 and not attempts:
                 continue
-        observation = path.observations[state.n_observations]
+        observation = path.observations[n_observations]
         observation.slot, observation.p_free, observation.time, observation.is_first = (
             s,
             p_free,
@@ -240,12 +244,15 @@ def _observe_here(search: Search, path: PathBuffer) -> None:
             is_first,
         )
         path.marks[s].observed_at = time
-        state.n_observations += 1
-        state.chooses = state.chooses or s == state.target
+        n_observations += 1
+        if s == target:
+            state.chooses = True
         if attempts:
             # The path continues only if the attempt failed.
             state.time += graph.failure_s
-    path.stops[state.n_stops].first = state.n_observations
+    state.n_observations, path.stops[state.n_stops].first = n_observations, n_observations
+    state.n_unproven -= n_first
+    state.n_unobserved -= n_first
 
 
 @step

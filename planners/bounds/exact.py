@@ -21,7 +21,7 @@ between two slots):
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,19 +31,49 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
-from parkenv.world.occupancy.day_error import EXACT, DayError
+from parkenv.world.occupancy.centred_logits import centred_logits
+from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
-from planners.bounds.days import Days
-from planners.road_table import RoadTable
+from planners.routes import RoadTable
 
 MOST_SLOTS = 25  # maximum number of slots; the key of a belief state has room for no more
 MOST_STATES = 8_000_000  # default maximum number of belief states: about 200 MB, and twice that while solving
 
+LEVELS, SLOPES = 13, 7  # numbers of levels and slopes of the grid, from -3.6 to 3.6 standard deviations
+_MOST_DEVIATIONS = 3.6
 _POSITION_BITS = 10
 _SEARCH_ENDS = -1
 _UNDECIDED = -2
 _CHUNK = 20_000
+
+
+class Days(NamedTuple):
+    """Days that a search may meet, on a grid of levels and slopes; slots are independent given the day."""
+
+    chance: FloatArray  # (k,) float64, probability of each day
+    p_free: FloatArray  # (n_slots, k) float64, P(free) of each slot on each day
+
+    @classmethod
+    def of(cls, p_occupied: FloatArray, walk: FloatArray, day_error: DayError) -> Self:
+        """Return the days of a forecast, (n_slots,); one day if they do not differ. `walk` orders the slots."""
+        near = nearness(walk)
+        if not day_error:
+            return cls(np.ones(1), 1.0 - p_occupied[:, None])
+        levels, level_chance = _grid(day_error.level, LEVELS)
+        slopes, slope_chance = _grid(day_error.slope, SLOPES)
+        shift = (levels + near[:, None, None] * slopes[:, None]).reshape(len(near), -1)
+        centre = centred_logits(p_occupied, day_error.deviations(near))[:, None]
+        return cls(np.outer(slope_chance, level_chance).ravel(), 1.0 / (1.0 + np.exp(centre + shift)))
+
+
+def _grid(deviation: float, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return values of a normal distribution around 0 and their probabilities, (k,) each."""
+    if deviation == 0.0:
+        return np.zeros(1), np.ones(1)
+    z = np.linspace(-_MOST_DEVIATIONS, _MOST_DEVIATIONS, count)
+    density = np.exp(-0.5 * z**2)
+    return deviation * z, density / density.sum()
 
 
 class _SmallLot(NamedTuple):
@@ -126,10 +156,7 @@ class ExactSolution:
     def decide(self, seen: int, vertex: int, free: int) -> tuple[float, int] | None:
         """Return the expected time, s, and the next vertex to observe from (-1: park); None for an unreachable state.
 
-        Args:
-            seen: slots observed, as a bit mask.
-            vertex: the start vertex, or a vertex that showed something new.
-            free: slots observed free, as a bit mask.
+        `seen` and `free` are bit masks; `vertex` is that of the start, or one that showed something new.
         """
         level = _popcount(seen)
         low, high = self._levels[level], self._levels[level + 1]
@@ -149,11 +176,11 @@ class ExactSolution:
         n = len(self._lot.cost_s)
         pending: list[list[IntArray]] = [[] for _ in range(n + 1)]
         pending[_popcount(root >> (n + _POSITION_BITS))].append(np.array([root], dtype=np.int64))
-        found, total = [], 0
+        levels_keys, total = list[IntArray](), 0
         for level in range(n + 1):
-            keys = np.unique(np.concatenate(pending[level])) if pending[level] else np.empty(0, np.int64)
+            keys = np.unique(np.concatenate([np.empty(0, np.int64), *pending[level]]))
             pending[level] = []
-            found.append(keys)
+            levels_keys.append(keys)
             total += len(keys)
             for start in range(0, len(keys), _CHUNK):
                 if total > most_states:
@@ -170,8 +197,8 @@ class ExactSolution:
                     f"slots than {n} (about 20 along one aisle, 16 along two, 11 where days differ), or a higher "
                     "most_states"
                 )
-        self._keys = np.concatenate(found)
-        self._levels = np.concatenate([[0], np.cumsum([len(keys) for keys in found])]).astype(np.int64)
+        self._keys = np.concatenate(levels_keys)
+        self._levels = np.cumsum([0, *(len(keys) for keys in levels_keys)])
 
 
 def require_small(problem: SearchProblem) -> None:
@@ -321,8 +348,7 @@ def _successors(keys: IntArray, lot: _SmallLot) -> IntArray:
 @compiled
 def _weigh_days(before: FloatArray, seen: int, free: int, lot: _SmallLot, after: FloatArray) -> None:
     """Multiply the weights of the days by the probability of observing `free` of the slots `seen` on each."""
-    for day in range(len(before)):
-        after[day] = before[day]
+    after[:] = before
     for s in range(len(lot.cost_s)):
         if (seen >> s) & 1:
             for d in range(len(before)):
@@ -347,8 +373,7 @@ def _back_up(
     for i in range(levels[level], levels[level + 1]):
         seen, vertex, free = _state(keys[i], n)
         # With a single day, what was observed says nothing, and dominated free slots are missing from `free`.
-        for d in range(len(day)):
-            day[d] = lot.day_chance[d]
+        day[:] = lot.day_chance
         if len(day) > 1:
             _weigh_days(lot.day_chance, seen, free, lot, day)
             day /= day.sum()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -138,9 +137,9 @@ class OracleAgent(SearchAgent[OracleState]):
         wait = self.wait(vertex)
         if memory.unobserved is not None:
             memory.unobserved[self.problem.in_view(vertex)] = False
-            target, seconds = self._nearest_unobserved(vertex, memory.unobserved)
-            if math.isfinite(seconds):
-                return self.routes.move_toward(vertex, target)
+            nearest, _ = self.routes.nearest(vertex, memory.unobserved)
+            if len(nearest):
+                return self.routes.move_toward(vertex, int(nearest[0]))
             # All reachable slots were observed, but the lot is not proven full: an unreachable slot is free.
             best = best_slot(self.problem, self.routes, self._world, vertex, now, self.problem.wait_s)
             vars(memory).update(vars(self._bound_for(best, vertex)))
@@ -167,8 +166,7 @@ class OracleAgent(SearchAgent[OracleState]):
         assert self._world is not None
         shown = np.zeros(self.problem.lot.n_slots, dtype=np.bool_)
         shown[self.problem.in_view(vertex)] = True
-        driven = 0.0
-        in_view_after = 0.0 if shown[slot] else np.inf
+        driven, in_view_after = 0.0, 0.0 if shown[slot] else np.inf
         for move, following in self.routes.hops(vertex, slot):
             driven += float(self.problem.move_s[vertex, move])
             vertex = following
@@ -185,22 +183,17 @@ class OracleAgent(SearchAgent[OracleState]):
                 return more
         return 0
 
-    def _nearest_unobserved(self, vertex: int, unobserved: NDArray[np.bool_]) -> tuple[int, float]:
-        """Return the next slot of the tour and the drive time to it, s; -1 and inf if none is reachable."""
-        slots, seconds = self.routes.nearest(vertex, unobserved)
-        return int(slots[0]) if len(slots) else -1, seconds
-
     def _tour_s(self, vertex: int, at_most: float) -> float:
         """Return the time, s, to observe every slot; inf if it exceeds `at_most` or a slot is unreachable."""
         unobserved = np.ones(self.problem.lot.n_slots, dtype=np.bool_)
         unobserved[self.problem.in_view(vertex)] = False
         total = 0.0
         while unobserved.any():
-            target, seconds = self._nearest_unobserved(vertex, unobserved)
+            nearest, seconds = self.routes.nearest(vertex, unobserved)
             total += seconds
             if not total < at_most:
                 return np.inf
             # Slots observed on the way are ignored: an upper bound is enough.
-            vertex = target
+            vertex = int(nearest[0])
             unobserved[self.problem.in_view(vertex)] = False
         return total

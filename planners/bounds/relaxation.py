@@ -89,7 +89,7 @@ class _News(NamedTuple):
 
 
 class _World(NamedTuple):
-    """A world."""
+    """The slots in groups in one world."""
 
     group: IntArray  # (n,) the group of each slot
     free_s: FloatArray  # (n,) s, when each slot is free first that a car can have reached
@@ -159,7 +159,7 @@ class SearchBound:
         worse_s = (total_s[slots] - total_s[slots[:1]])[np.triu_indices(len(slots), 1)[1]]
         apart_s = apart_s[np.triu_indices(len(slots), 1)] * np.exp(-worse_s / FINE_S)
         tree = linkage(apart_s, "average") if len(slots) > 1 else None
-        found, n_groups = None, 1
+        finest, n_groups = None, 1
         while n_groups <= min(len(slots), _MOST_GROUPS):
             group = np.zeros(len(slots), np.int64)
             if tree is not None:
@@ -167,9 +167,9 @@ class SearchBound:
             ways = self._ways(vertex, slots, group)
             if ways is None:
                 break
-            found, n_groups = (group, ways), n_groups + 1 + n_groups // 8
-        assert found is not None
-        return _Start(slots, found[0], float(total_s[others[0]]) if len(others) else np.inf, found[1])
+            finest, n_groups = (group, ways), n_groups + 1 + n_groups // 8
+        assert finest is not None
+        return _Start(slots, finest[0], float(total_s[others[0]]) if len(others) else np.inf, finest[1])
 
     def _ways(self, vertex: int, slots: IntArray, group: IntArray) -> _Ways | None:
         """Return the ways from a vertex; None if there are too many states, unless there is only one group."""
@@ -190,12 +190,8 @@ class SearchBound:
             n_states += len(gates[known])
             if n_states > self._most_states and group.any():
                 return None
-            seconds = np.array(
-                [
-                    _drive_in_sight(v, known, shows, lot.neighbors, self._problem.move_cost_s)
-                    for v in gates[known]
-                ]
-            )
+            edges = lot.neighbors, self._problem.move_cost_s
+            seconds = np.array([_drive_in_sight(v, known, shows, *edges) for v in gates[known]])
             new = np.flatnonzero(np.isfinite(seconds.min(axis=0)) & (shows & ~known != 0))
             following = [(known | int(shows[v]), int(v)) for v in new]
             for more, v in following:
@@ -213,25 +209,24 @@ class SearchBound:
         }
         seen_slots = np.repeat((np.array(sets)[:, None] >> group) & 1 == 1, np.diff(first), axis=0)
         slot_s = np.where(seen_slots, np.concatenate([seconds[:, slots] for seconds, _ in drives]), np.inf)
-        away_s = {v: self._routes.seconds_from(v)[slots] for v in {v for its in gates.values() for v in its}}
+        away_s = {
+            v: self._routes.seconds_from(v)[slots]
+            for v in {v for vertices in gates.values() for v in vertices}
+        }
         direct_s = np.where(seen_slots, [away_s[v] for known in sets for v in gates[known]], np.inf)
         blocks = [seconds[:, [v for _, v in following]].ravel() for seconds, following in drives]
-        edges = (
+        steps = (
             np.cumsum([0, *(len(following) for _, following in drives)]),
             np.array([number[state] for _, following in drives for state in following], np.int64),
             np.cumsum([0, *(len(block) for block in blocks)]),
             np.concatenate(blocks),
         )
-        return _Ways(np.array(sets, np.int64), first, slot_s, direct_s, _earliest(first, *edges), *edges)
+        return _Ways(np.array(sets, np.int64), first, slot_s, direct_s, _earliest(first, *steps), *steps)
 
     def _bound(self, start: _Start, law: SlotLaw, after: FloatArray, free: FloatArray) -> float:
-        """Return the bound.
+        """Return the bound, given the law of the slots in groups on the day.
 
-        Args:
-            start: where the search begins.
-            law: of the slots in groups, given the day.
-            after: (n,) s from the arrival until a car can be at each slot.
-            free: (n,) s from the arrival until each is free then, at that time or later.
+        `after` and `free`, (n,) s from the arrival: until a car can be at each slot, and until it is free then.
         """
         cost_s = self._problem.arrival_cost_s[start.slots]
         p_taken = law.p_taken_after(after)
@@ -244,8 +239,8 @@ class SearchBound:
         slot, period = np.divmod(np.flatnonzero(chance.T > 0.0), len(chance))
         from_s = np.vstack([np.zeros(len(after)), after, ends])[period, slot]
         news = _News(slot, chance[period, slot], start.group)
-        told = np.full((len(after), len(chance) + 1), len(slot))
-        told[slot, period] = np.arange(len(slot))
+        revealed = np.full((len(after), len(chance) + 1), len(slot))
+        revealed[slot, period] = np.arange(len(slot))
         now = (free > after) + (free > ends).sum(axis=0)
         ways = start.ways
         # Time left at a state if the car goes to a slot that is free from a moment on; no news: infinite
@@ -253,7 +248,7 @@ class SearchBound:
         left_s[:, :-1] = np.maximum(ways.direct_s[:, slot], from_s - ways.earliest_s[:, None]) + cost_s[slot]
         world = _World(start.group, free, cost_s)
         longest_s = min((PERIODS[-1] + 1.0) * nothing_s, self._problem.give_up_s)
-        penalty = _penalties(ways, news, left_s, longest_s, told[np.arange(len(after)), now])
+        penalty = _penalties(ways, news, left_s, longest_s, revealed[np.arange(len(after)), now])
         return float(_least_s(ways, penalty, world, start.beyond_s, self._problem.give_up_s))
 
 
@@ -307,18 +302,13 @@ def _earliest(
 
 @compiled(error_model="numpy")
 def _penalties(
-    ways: _Ways, news: _News, left_s: NDArray[np.float32], longest_s: float, told: IntArray
+    ways: _Ways, news: _News, left_s: NDArray[np.float32], longest_s: float, revealed: IntArray
 ) -> FloatArray:
     """Return the penalty, s, of each way on from a set, and of what the first state shows, (n_next + 1,).
 
-    `value`, of each state and slot that is known, or none, is about the least expected time from there.
-
-    Args:
-        ways: the states.
-        news: what a car may be told.
-        left_s: (n_states, m + 1) s, time left if the car goes to a slot that it was told of; inf for the others.
-        longest_s: s, time left where no slot is known and nothing is left to be seen.
-        told: (n,) what is told of each slot in this world.
+    `left_s`, (n_states, m + 1), is the time left if the car goes to a slot of which it knows the news, inf for the
+    others; at most `longest_s` it is `value`, about the least expected time from a state with that slot in mind.
+    `revealed`, (n,), is the news of each slot in this world.
     """
     m = len(news.slot)
     value = np.minimum(left_s, np.float32(longest_s))
@@ -339,8 +329,8 @@ def _penalties(
             for at in range(n_seen + 1):
                 place = np.searchsorted(best_s, left_s[y, seen[at]])
                 onward[at] = mean[place] + rest[place] * value[y, seen[at]]
-            before = _best_told(ways.sets[k], left_s[y], news, told)
-            after = _best_told(of_set, left_s[y], news, told)
+            before = _best_revealed(ways.sets[k], left_s[y], news, revealed)
+            after = _best_revealed(of_set, left_s[y], news, revealed)
             place = np.searchsorted(best_s, left_s[y, before])
             penalty[ways.first_next[k] + i] = mean[place] + rest[place] * value[y, before] - value[y, after]
             for x in range(ways.first[k], ways.first[k + 1]):
@@ -348,21 +338,16 @@ def _penalties(
                 for at in range(n_seen + 1):
                     value[x, seen[at]] = min(value[x, seen[at]], drive + onward[at])
     order, mean, rest = _mean_value(ways.sets[0], left_s[0], value[0], news)
-    best = _best_told(ways.sets[0], left_s[0], news, told)
+    best = _best_revealed(ways.sets[0], left_s[0], news, revealed)
     penalty[-1] = mean[-1] + rest[-1] * value[0, m] - value[0, best]
     return penalty
 
 
 @compiled(error_model="numpy")
 def _least_s(ways: _Ways, penalty: FloatArray, world: _World, beyond_s: float, give_up_s: float) -> float:
-    """Return the least time of a car that knows the world and pays the penalties.
+    """Return the least time of a car that knows the world and pays the penalties, see `_penalties`.
 
-    Args:
-        ways: the states.
-        penalty: s, see `_penalties`.
-        world: what the world is.
-        beyond_s: s, least time of parking in a slot without a group.
-        give_up_s: s, penalty that a car can choose where all groups have been seen.
+    It may park in a slot without a group, from `beyond_s` on, or pay `give_up_s` where all groups have been seen.
     """
     total_s, penalty_s = np.full(len(ways.earliest_s), np.inf), np.full(len(ways.earliest_s), np.inf)
     every, least = 0, np.inf
@@ -391,12 +376,12 @@ def _least_s(ways: _Ways, penalty: FloatArray, world: _World, beyond_s: float, g
 
 
 @compiled(error_model="numpy")
-def _best_told(known: int, left_s: NDArray[np.float32], news: _News, told: IntArray) -> int:
-    """Return the best of what is told of the slots of known groups: that with the least time left at a state."""
+def _best_revealed(known: int, left_s: NDArray[np.float32], news: _News, revealed: IntArray) -> int:
+    """Return the news of the slots of known groups with the least time left at a state."""
     best = len(news.slot)
-    for s in range(len(told)):
-        if (known >> news.group[s]) & 1 and left_s[told[s]] < left_s[best]:
-            best = told[s]
+    for s in range(len(revealed)):
+        if (known >> news.group[s]) & 1 and left_s[revealed[s]] < left_s[best]:
+            best = revealed[s]
     return int(best)
 
 
@@ -412,9 +397,8 @@ def _mean_value(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Average `value` at a state over what new groups may be.
 
-    Returns:
-        What may be told of their slots, best first, (k,); the sum of the value over the first i, weighted with the
-        probability that each is the best that is told, and the probability that none of them is told, (k + 1,).
+    Return the possible news of their slots, best first, (k,); the sum of the value over the first i, weighted with the
+    probability that each is the best, and the probability that there is none of them, (k + 1,).
     """
     order, k = np.empty(len(news.slot), np.int64), 0
     for j in range(len(news.slot)):
@@ -425,7 +409,7 @@ def _mean_value(
     order = order[np.argsort(left_s[order])]
     mean, rest, other = np.zeros(k + 1), np.ones(k + 1), np.ones(len(news.group))
     for i in range(k):
-        # What is told of a slot excludes the rest that may be told of it.
+        # The news of a slot excludes other news of it.
         s, chance = news.slot[order[i]], news.chance[order[i]]
         best = rest[i] / other[s] * chance if other[s] > _SURE else 0.0
         other[s] -= chance

@@ -12,6 +12,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.vehicle import VehicleParameters, move_along
 
 SHORTEST_ARC = 1e-6  # arcs shorter than this, m, are ignored
+_STRAIGHT = 1e-5  # rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,3 +59,43 @@ class CarPath:
             curvature += [bend] * n
             direction += [math.copysign(1.0, length)] * n
         return np.array(poses), np.array(curvature), np.array(direction)
+
+
+def rounded(points: FloatArray, radius: float) -> CarPath:
+    """Make a path along a polyline with rounded corners.
+
+    Args:
+        points: (k, 2) m, two or more, in the order driven.
+        radius: radius of the arcs, m; smaller where legs are short: an arc uses at most half of each adjacent leg.
+    """
+    step = np.diff(points, axis=0)
+    leg = np.hypot(step[:, 0], step[:, 1])
+    step, leg = step[leg > 1e-9], leg[leg > 1e-9]
+    yaw = np.arctan2(step[:, 1], step[:, 0])
+    lengths, curvatures = [], []
+    taken = 0.0
+    for i in range(len(leg)):
+        turn = math.remainder(float(yaw[i + 1] - yaw[i]), 2.0 * math.pi) if i + 1 < len(leg) else 0.0
+        cut = 0.0
+        if abs(turn) > _STRAIGHT:
+            cut = min(radius * math.tan(0.5 * abs(turn)), 0.5 * leg[i], 0.5 * leg[i + 1])
+        lengths.append(float(leg[i]) - taken - cut)
+        curvatures.append(0.0)
+        if cut > 0.0:
+            arc = cut / math.tan(0.5 * abs(turn))
+            lengths.append(arc * abs(turn))
+            curvatures.append(math.copysign(1.0 / arc, turn))
+        taken = cut
+    start = np.array([*points[0], yaw[0]])
+    return CarPath(start, np.array(lengths), np.array(curvatures))
+
+
+def joined(first: CarPath, second: CarPath) -> CarPath:
+    """Concatenate two paths; the second starts where the first ends."""
+    return CarPath(
+        first.start,
+        np.r_[first.length, second.length],
+        np.r_[first.curvature, second.curvature],
+        first.expansions + second.expansions,
+        min(first.margin, second.margin),
+    )

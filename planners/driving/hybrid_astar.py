@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,23 +18,36 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import VehicleParameters, move_along
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_whole
 from planners.driving.car_path import CarPath
 from planners.driving.clearance import CELL_M, Clearance, clearance, room_at
-from planners.driving.grid_distances import GRID_CELLS, grid_distances
-from planners.driving.path_shortening import shorten_path
 from planners.driving.reeds_shepp import PIECES, Words, distance_between, words_buffer
-from planners.driving.reeds_shepp_shots import DriveCosts, arc_is_free, cheapest_shot, free_length
+from planners.driving.reeds_shepp_shots import (
+    DriveCosts,
+    arc_is_free,
+    cheapest_shot,
+    free_length,
+    shorten_path,
+)
 
 WINDOW_M = 9.0
 """Margin, m, around start and target within which the car may drive."""
 
+_GRID_CELLS = 2  # cells of the distance field per cell of the heuristic's grid
 _STEERINGS = np.array([0.0, 0.5, -0.5, 1.0, -1.0])
 _MOST_NODES = 60_000
 # Size of the hash table of cells, and a factor that spreads them over it.
 _TABLE, _SPREAD = 1 << 17, 0x9E3779B1
 _TIGHT_CELL_M, _TIGHT_YAW_CELLS, _FINE_BELOW_M = 0.02, 720, 0.01  # halved where a move has less clearance
 _SHORTEST_M, _LONGEST_M = 0.02, 1.5  # of moves that end where the car would touch something
+
+
+class Limits(NamedTuple):
+    """Greed and limits of one attempt; as in `SearchSettings`."""
+
+    greed: float
+    most_expansions: int
+    patience: float
 
 
 @dataclass(frozen=True)
@@ -59,28 +73,17 @@ class SearchSettings:
     steer_m: float = 0.4
     reserve: float = 0.06
     attempts: tuple[tuple[float, float], ...] = (
-        (0.20, 0.5),
-        (0.10, 0.5),
-        (0.05, 0.5),
-        (0.05, 0.0),
-        (0.02, 0.0),
-        (0.01, 0.0),
-    )
+        (0.20, 0.5), (0.10, 0.5), (0.05, 0.5), (0.05, 0.0), (0.02, 0.0), (0.01, 0.0),
+    )  # fmt: skip
     greed: float = 1.3
     most_expansions: int = 20_000
     patience: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, least in (
-            ("change_m", 0.0),
-            ("steer_m", 0.0),
-            ("reserve", 0.0),
-            ("greed", 1.0),
-            ("patience", 0.0),
-        ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= least):
-                raise InputError(f"search {name} is {value!r}, want at least {least:g}")
+        for name in ("change_m", "steer_m", "reserve", "patience"):
+            require_number(f"search {name}", getattr(self, name), least=0.0)
+        require_number("search greed", self.greed, least=1.0)
+        require_whole("search most_expansions", self.most_expansions, least=1)
         if not self.attempts or any(
             margin < 0.0 or not (move == 0.0 or 0.05 <= move <= 2.0) for margin, move in self.attempts
         ):
@@ -88,8 +91,6 @@ class SearchSettings:
                 f"search attempts are {self.attempts!r}, want pairs of a margin, 0 m or more, and a move, 0 or "
                 "0.05 to 2 m"
             )
-        if self.most_expansions < 1:
-            raise InputError(f"search most_expansions is {self.most_expansions}, want at least 1")
 
 
 def plan_path(
@@ -132,11 +133,11 @@ def plan_path(
         if (margin, move) == tried:
             continue
         tried = (margin, move)
-        left = grid_distances(space, start[0], start[1], space.half[1] + margin)
+        left = _grid_distances(space, start[0], start[1], space.half[1] + margin)
         costs = DriveCosts(radius, margin, settings.change_m, settings.steer_m)
         goal = np.array(start, dtype=np.float64)
-        limits = settings.greed, settings.most_expansions, settings.patience
-        lengths, curvatures, opened = _search(space, left, origin, goal, costs, move, *limits)
+        limits = Limits(settings.greed, settings.most_expansions, settings.patience)
+        lengths, curvatures, opened = _search(space, left, origin, goal, costs, move, limits)
         expansions += opened
         if len(lengths):
             lengths, curvatures = shorten_path(space, origin, lengths, curvatures, costs)
@@ -162,6 +163,42 @@ def why_no_path(
 
 
 @compiled(error_model="numpy")
+def _grid_distances(space: Clearance, x: float, y: float, least: float) -> FloatArray:
+    """Return the shortest distances, m, of all cells to a point, for a disc of radius `least`; inf if unreachable.
+
+    It is the heuristic that ignores the car's kinematics.
+    """
+    step = CELL_M * _GRID_CELLS
+    rows, columns = space.field.shape[0] // _GRID_CELLS, space.field.shape[1] // _GRID_CELLS
+    left = np.full((rows, columns), math.inf)
+    keys, cells = np.empty(8 * rows * columns + 8), np.empty(8 * rows * columns + 8, np.int32)
+    row, column = int((y - space.low[1]) / step), int((x - space.low[0]) / step)
+    if row < 0 or column < 0 or row >= rows or column >= columns:
+        return left
+    left[row, column] = 0.0
+    size = push(keys, cells, 0, 0.0, row * columns + column)
+    while size > 0:
+        key, cell = keys[0], cells[0]
+        size = pop(keys, cells, size)
+        row, column = cell // columns, cell % columns
+        if key > left[row, column]:
+            continue
+        for dr in range(-1, 2):
+            for dc in range(-1, 2):
+                r, c = row + dr, column + dc
+                if r < 0 or c < 0 or r >= rows or c >= columns or (dr == 0 and dc == 0):
+                    continue
+                # Allow for half a grid cell and the field's error, so that distances are not overestimated.
+                if space.field[r * _GRID_CELLS, c * _GRID_CELLS] + 0.35 < least:
+                    continue
+                further = key + step * math.sqrt(float(dr * dr + dc * dc))
+                if further < left[r, c] - 1e-9:
+                    left[r, c] = further
+                    size = push(keys, cells, size, further, r * columns + c)
+    return left
+
+
+@compiled(error_model="numpy")
 def _search(
     space: Clearance,
     left: FloatArray,
@@ -169,9 +206,7 @@ def _search(
     end: FloatArray,
     costs: DriveCosts,
     move: float,
-    greed: float,
-    most_expansions: int,
-    patience: float,
+    limits: Limits,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Run hybrid A*; return lengths, m, and curvatures, 1/m, of the arcs from start to end, and the expansions."""
     # Best node per cell and direction of arrival, in a hash table. In a tight slot moves shift the car sideways by
@@ -190,11 +225,11 @@ def _search(
     words, radius = Words(*words_buffer()), costs.radius
     shot_piece, shot_turn = np.zeros(PIECES), np.zeros(PIECES, np.int64)
     shot_count, shot_node, best = 0, -1, math.inf
-    coarse = CELL_M * GRID_CELLS
+    coarse = CELL_M * _GRID_CELLS
 
     pose[0], cost[0], parent[0], way[0], steering[0] = start, 0.0, -1, 0.0, 0.0
     n, size = 1, push(keys, queue, 0, 0.0, 0)
-    opened, last = 0, most_expansions
+    opened, last = 0, limits.most_expansions
     while size > 0 and opened < last and n < _MOST_NODES - 16:
         key, node = keys[0], queue[0]
         size = pop(keys, queue, size)
@@ -210,7 +245,7 @@ def _search(
             word, more = cheapest_shot(space, x, y, yaw, end, costs, way[node], steering[node], below, words)
             if word >= 0:
                 if shot_node < 0:
-                    last = min(last, opened + int(patience * opened) + 32)
+                    last = min(last, opened + int(limits.patience * opened) + 32)
                 best, shot_node, shot_count = cost[node] + more, node, words.n_pieces[word]
                 for i in range(len(shot_piece)):
                     shot_piece[i], shot_turn[i] = words.piece[word, i], words.turn[word, i]
@@ -254,7 +289,7 @@ def _search(
                 cost[n], parent[n], way[n], steering[n] = g, node, length, share
                 if old >= 0:
                     closed[old] = True
-                size = push(keys, queue, size, g + greed * h, n)
+                size = push(keys, queue, size, g + limits.greed * h, n)
                 n += 1
     if shot_node < 0:
         return np.empty(0), np.empty(0), opened

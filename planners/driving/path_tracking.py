@@ -18,7 +18,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED
 from parkenv.driving.vehicle import VehicleParameters, move_along
-from parkenv.errors import InputError
+from parkenv.errors import require_number
 from planners.driving.car_path import CarPath
 
 SAMPLE_M = 0.05
@@ -51,9 +51,7 @@ class TrackingSettings:
 
     def __post_init__(self) -> None:
         for name in ("speed", "reverse_speed", "acceleration", "firmness", "blend_m", "control_s"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"tracking {name} is {value!r}, want above 0")
+            require_number(f"tracking {name}", getattr(self, name), above=0.0)
 
     def within(self, vehicle: VehicleParameters) -> Self:
         """Return the same within the limits of a vehicle, with some acceleration left for feedback."""
@@ -102,12 +100,9 @@ class PathTracker:
         self._vehicle = vehicle
         self._settings = settings = (settings or TrackingSettings()).within(vehicle)
         self._segments = _segments(vehicle, path, settings)
-        self._segment = 0
-        self._at = 0
-        self._set_off = False
-        self.done = False
-        self.offset = 0.0
-        self.askew = 0.0
+        self._segment = self._at = 0
+        self._set_off = self.done = False
+        self.offset = self.askew = 0.0
 
     def command(self, pose: FloatArray, speed: float, steering: float) -> tuple[float, float]:
         """Return the acceleration and steering commands, -1 to 1 each, for `parkenv.driving.vehicle.advance`.
@@ -188,6 +183,32 @@ class PathTracker:
         return min(max(needed / limit, -1.0), 1.0)
 
 
+class LaneKeeper(PathTracker):
+    """Follow a path on a lane, starting at the current speed.
+
+    Args:
+        vehicle: the car.
+        path: the path.
+        settings: settings of the tracking.
+        aside: maximum lateral acceleration, m/s²; the car slows down in turns accordingly.
+    """
+
+    def __init__(
+        self,
+        vehicle: VehicleParameters,
+        path: CarPath,
+        settings: TrackingSettings | None = None,
+        aside: float = 1.8,
+    ) -> None:
+        super().__init__(vehicle, path, settings)
+        self._set_off = True
+        most = 1.5 * self._settings.acceleration
+        for segment in self._segments:
+            bend = np.maximum(np.abs(segment.curvature), 1e-6)
+            np.minimum(segment.pace, np.sqrt(aside / bend), out=segment.pace)
+            _brake_ahead(segment.pace, segment.station, most)
+
+
 @dataclass(frozen=True, eq=False)
 class _Segment:
     """A sampled path between two changes of direction."""
@@ -247,8 +268,14 @@ def _pace(
             steep = max(steep, abs(wheels[j + 1] - wheels[j]) / max(station[j + 1] - station[j], 1e-6))
         pace[i] = min(fastest, rate / max(steep, 1e-9))
     pace[n - 1] = 0.0
-    for i in range(n - 2, -1, -1):
+    _brake_ahead(pace, station, acceleration)
+    return pace
+
+
+@compiled(error_model="numpy")
+def _brake_ahead(pace: FloatArray, station: FloatArray, acceleration: float) -> None:
+    """Lower speed limits, (n,) m/s, so that the car may brake to each of them in time."""
+    for i in range(len(pace) - 2, -1, -1):
         pace[i] = min(
             pace[i], math.sqrt(pace[i + 1] ** 2 + 2.0 * acceleration * (station[i + 1] - station[i]))
         )
-    return pace

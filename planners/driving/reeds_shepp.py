@@ -9,6 +9,7 @@ right, and reversing the order of the pieces.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +62,13 @@ def _outer(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[float
 
 
 @compiled(error_model="numpy")
+def _word(lengths: Sequence[float], turns: Sequence[int], piece: FloatArray, turn: IntArray) -> int:
+    for i in range(len(lengths)):
+        piece[i], turn[i] = lengths[i], turns[i]
+    return len(lengths)
+
+
+@compiled(error_model="numpy")
 def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, turn: IntArray) -> int:
     """Evaluate one of the eight formulas for a pose; fill lengths and turns, return the number of pieces or 0.
 
@@ -73,9 +81,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(phi - t)
         if t < -_EDGE or v < -_EDGE:
             return 0
-        piece[0], piece[1], piece[2] = t, u, v
-        turn[0], turn[1], turn[2] = LEFT, STRAIGHT, LEFT
-        return 3
+        return _word((t, u, v), (LEFT, STRAIGHT, LEFT), piece, turn)
     if number == 1:  # L S R
         square = across * across + down * down
         if square < 4.0:
@@ -85,9 +91,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(t - phi)
         if t < -_EDGE or v < -_EDGE:
             return 0
-        piece[0], piece[1], piece[2] = t, u, v
-        turn[0], turn[1], turn[2] = LEFT, STRAIGHT, RIGHT
-        return 3
+        return _word((t, u, v), (LEFT, STRAIGHT, RIGHT), piece, turn)
     if number == 2:  # L R- L, with the last turn in either direction
         far = math.hypot(ahead, left)
         if far > 4.0:
@@ -97,9 +101,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(phi - t + u)
         if t < -_EDGE or u > _EDGE:
             return 0
-        piece[0], piece[1], piece[2] = t, u, v
-        turn[0], turn[1], turn[2] = LEFT, RIGHT, LEFT
-        return 3
+        return _word((t, u, v), (LEFT, RIGHT, LEFT), piece, turn)
     if number == 3:  # L R L- R-
         share = 0.25 * (2.0 + math.hypot(across, down))
         if share > 1.0:
@@ -108,9 +110,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         t, v = _outer(u, -u, across, down, phi)
         if t < -_EDGE or v > _EDGE:
             return 0
-        piece[0], piece[1], piece[2], piece[3] = t, u, -u, v
-        turn[0], turn[1], turn[2], turn[3] = LEFT, RIGHT, LEFT, RIGHT
-        return 4
+        return _word((t, u, -u, v), (LEFT, RIGHT, LEFT, RIGHT), piece, turn)
     if number == 4:  # L R- L- R
         share = (20.0 - across * across - down * down) / 16.0
         if share < 0.0 or share > 1.0:
@@ -119,9 +119,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         t, v = _outer(u, u, across, down, phi)
         if u < -_HALF or t < -_EDGE or v < -_EDGE:
             return 0
-        piece[0], piece[1], piece[2], piece[3] = t, u, u, v
-        turn[0], turn[1], turn[2], turn[3] = LEFT, RIGHT, LEFT, RIGHT
-        return 4
+        return _word((t, u, u, v), (LEFT, RIGHT, LEFT, RIGHT), piece, turn)
     if number == 5:  # L R- S- L-
         far = math.hypot(ahead, left)
         if far < 2.0:
@@ -132,9 +130,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(phi - _HALF - t)
         if t < -_EDGE or u > _EDGE or v > _EDGE:
             return 0
-        piece[0], piece[1], piece[2], piece[3] = t, -_HALF, u, v
-        turn[0], turn[1], turn[2], turn[3] = LEFT, RIGHT, STRAIGHT, LEFT
-        return 4
+        return _word((t, -_HALF, u, v), (LEFT, RIGHT, STRAIGHT, LEFT), piece, turn)
     if number == 6:  # L R- S- R-
         far = math.hypot(across, down)
         if far < 2.0:
@@ -144,9 +140,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(t + _HALF - phi)
         if t < -_EDGE or u > _EDGE or v > _EDGE:
             return 0
-        piece[0], piece[1], piece[2], piece[3] = t, -_HALF, u, v
-        turn[0], turn[1], turn[2], turn[3] = LEFT, RIGHT, STRAIGHT, RIGHT
-        return 4
+        return _word((t, -_HALF, u, v), (LEFT, RIGHT, STRAIGHT, RIGHT), piece, turn)
     # L R- S- L- R
     far = math.hypot(across, down)
     if far < 2.0:
@@ -158,9 +152,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
     v = _turned(t - phi)
     if t < -_EDGE or v < -_EDGE:
         return 0
-    piece[0], piece[1], piece[2], piece[3], piece[4] = t, -_HALF, u, -_HALF, v
-    turn[0], turn[1], turn[2], turn[3], turn[4] = LEFT, RIGHT, STRAIGHT, LEFT, RIGHT
-    return 5
+    return _word((t, -_HALF, u, -_HALF, v), (LEFT, RIGHT, STRAIGHT, LEFT, RIGHT), piece, turn)
 
 
 @compiled(error_model="numpy")

@@ -88,13 +88,7 @@ def decide_usual(address: int, number: int) -> int:
 
 
 class TargetPolicy(CompiledPolicy):
-    """The compiled policy of a `TargetAgent`.
-
-    Args:
-        name: for tables.
-        heuristic: a rule of `planners.heuristics.rules`, such as `GREEDY_GOAL`.
-        within_m: option of `first-free`.
-    """
+    """The compiled policy of a `TargetAgent`: its name, its rule, such as `GREEDY_GOAL`, and `first-free`'s option."""
 
     def __init__(self, name: str, heuristic: int, within_m: float | None = None) -> None:
         super().__init__(name, decide_by_rule)

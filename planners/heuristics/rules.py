@@ -94,18 +94,15 @@ tables_at = record_at(TABLES)
 
 
 def heuristic_tables(heuristic: int, problems: Sequence[SearchProblem], within_m: float | None) -> PolicyData:
-    """Return the tables of a heuristic.
+    """Return the tables of a heuristic, such as `GREEDY_GOAL`, for the problem of each place, all in one lot.
 
-    Args:
-        heuristic: such as `GREEDY_GOAL`.
-        problems: the problem of each place, all in one lot.
-        within_m: distance from the goal up to which `FIRST_FREE` takes a free slot at once, m; None: the median's.
+    `within_m` is the distance from the goal up to which `FIRST_FREE` takes a free slot at once; None: the median's.
     """
-    lot, costs_s = problems[0].lot, np.array([one.arrival_cost_s for one in problems], np.float64)
+    lot, costs_s = problems[0].lot, np.array([problem.arrival_cost_s for problem in problems], np.float64)
     n, room = lot.n_vertices, _N_MOVES * lot.n_vertices + 1
     near_s = [
-        np.median(cost_s[np.isfinite(cost_s)]) if within_m is None else within_m / one.v_walk
-        for one, cost_s in zip(problems, costs_s, strict=True)
+        np.median(cost_s[np.isfinite(cost_s)]) if within_m is None else within_m / problem.v_walk
+        for problem, cost_s in zip(problems, costs_s, strict=True)
     ]
     least_price = int(problems[0].parking_cost_s.argmin())
     numbers = {"heuristic": heuristic, "n_slots": lot.n_slots, "n_vertices": n, "least_price": least_price}
@@ -127,13 +124,7 @@ def heuristic_tables(heuristic: int, problems: Sequence[SearchProblem], within_m
 
 @rule
 def keeps_target(heuristic: int, target: int, state: int) -> bool:
-    """Return whether the target is kept whatever was observed of other slots.
-
-    Args:
-        heuristic: such as `GREEDY_GOAL`.
-        target: the slot to drive to, or `NO_SLOT`.
-        state: its recent state, see `SlotBelief.recent_state`.
-    """
+    """Return whether a target, or `NO_SLOT`, in a recent state is kept whatever was observed of other slots."""
     if target == NO_SLOT or state == OBSERVED_TAKEN:
         return False
     return heuristic not in (FIRST_FREE, GREEDY_TOTAL) or state == OBSERVED_FREE
@@ -273,9 +264,9 @@ def _first_free(tables: Any, place: int, search: int, vertex: int, previous: int
         slot = _known_slot(search, i)
         is_near = cost_of(tables, place, search, slot) <= near_s
         if is_near and state_of(tables, search, slot) == OBSERVED_FREE:
-            found = _nearest(tables, place, search, vertex, True, near_s, BY_DRIVE)
-            if found != NO_SLOT:
-                return int(found)
+            nearest = _nearest(tables, place, search, vertex, True, near_s, BY_DRIVE)
+            if nearest != NO_SLOT:
+                return int(nearest)
             break
     if previous == NO_SLOT:
         return int(_cheapest(tables, place, search, vertex))
@@ -310,17 +301,17 @@ def _cheapest(tables: Any, place: int, search: int, vertex: int) -> int:
         cost_s = cost_of(tables, place, search, slot)
         if cost_s < least and state_of(tables, search, slot) != OBSERVED_TAKEN:
             least = cost_s
-    found = int(_nearest(tables, place, search, vertex, False, least, BY_DRIVE))
-    if found == NO_SLOT and least < np.inf:
+    best = int(_nearest(tables, place, search, vertex, False, least, BY_DRIVE))
+    if best == NO_SLOT and least < np.inf:
         # It cannot be reached: among those that can.
         _search_everywhere(tables, place, search, vertex)
         for slot in range(tables.n_slots):
             cost_s = cost_of(tables, place, search, slot)
             if max(cost_s, seconds[slot]) == np.inf or state_of(tables, search, slot) == OBSERVED_TAKEN:
                 continue
-            if found == NO_SLOT or (cost_s, seconds[slot]) < (lowest, seconds[found]):
-                found, lowest = slot, cost_s
-    return found
+            if best == NO_SLOT or (cost_s, seconds[slot]) < (lowest, seconds[best]):
+                best, lowest = slot, cost_s
+    return best
 
 
 @rule
@@ -333,16 +324,10 @@ def _search_everywhere(tables: Any, place: int, search: int, vertex: int) -> Non
 def _nearest(
     tables: Any, place: int, search: int, vertex: int, only_free: bool, limit_s: float, order: int
 ) -> int:
-    """Return the first of some slots (Dijkstra's algorithm); among equals, that of the lowest number, or `NO_SLOT`.
+    """Return the first slot in an `order`, such as `BY_DRIVE` (Dijkstra's algorithm), or `NO_SLOT`.
 
-    Args:
-        tables: the TABLES record; drive times are exact up to the slot afterwards, upper bounds beyond.
-        place: index of the problem.
-        search: address of the SEARCH record, or 0.
-        vertex: where the car is.
-        only_free: whether only slots observed free count, not all candidates.
-        limit_s: arrival cost up to which slots count, s.
-        order: what slots are ranked by, such as `BY_DRIVE`.
+    Among equals it is that of the lowest number. Only slots up to an arrival cost of `limit_s` count. Afterwards drive
+    times in the tables are exact up to the slot, upper bounds beyond.
     """
     seconds, reached, last_edge = float64s(tables.seconds), int32s(tables.reached), int32s(tables.last_edge)
     neighbors, move_s = int32s(tables.neighbors), float64s(tables.move_s)

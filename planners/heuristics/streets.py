@@ -1,4 +1,4 @@
-"""The rule of `usual`, compiled: which street to try next, by what it costs and how likely it is full.
+"""The rule of `usual`, compiled: the next street to try, by its cost and its chance of a free slot.
 
 A *place* is a run of slots on one side of a street, between two junctions and in one zone, or a counted facility. The
 rule is Pandora's (Weitzman 1979), with places as boxes that take a drive to open: a place where n slots were not
@@ -7,9 +7,9 @@ arrival cost c and the drive d there. The driver goes to the place of the lowest
 slot on its way that costs no more than what is left of that index, and goes on to the next place where one is full.
 
 p is the forecast, corrected by what the driver remembers: the odds that a slot of a zone is free are multiplied by how
-many slots of it were seen free over how many were expected, with `DOUBT` added to both (the posterior mean of a factor
-that has a gamma law with mean 1 beforehand). After some full streets, the next ones of the zone promise less, and
-garages more.
+many slots of it were seen free over how many were expected, with `PRIOR_PSEUDO_COUNT` added to both (the posterior mean
+of a factor that has a gamma law with mean 1 beforehand). After some full streets, the next ones of the zone promise
+less, and garages more.
 
 People do the same: on the way they judge by the spaces they pass how many are still to come, and once they have missed
 the goal, they search an area that grows with time (PARKAGENT: Benenson, Martens and Birfir 2008, from surveys). Here
@@ -60,7 +60,7 @@ from planners.heuristics.rules import (
     state_of,
 )
 
-DOUBT = 1.0
+PRIOR_PSEUDO_COUNT = 1.0
 """Free slots, seen and expected, that stand for what a driver believes of a zone before it has seen any of it."""
 _N_MOVES = len(MOVES)
 _NONE = -1
@@ -147,33 +147,24 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
     bounds = [
         np.minimum.reduceat(np.array(costs_s)[:, streets["slots"]], first, axis=1) - 1e-6
         for costs_s in (
-            [one.walk_s + lot.slot_parking_cost_s for one in problems],
+            [problem.walk_s + lot.slot_parking_cost_s for problem in problems],
             plain.arrays["arrival_cost_s"],
         )
     ]
+    walk, cost = bounds
     numbers = {
-        "plain": plain.address,
-        "n_slots": lot.n_slots,
-        "n_zones": len(lot.zones),
-        "n_junctions": n_junctions,
-        "n_streets": n_streets,
-        "n_places": len(first),
-    }
+        "plain": plain.address, "n_slots": lot.n_slots, "n_zones": len(lot.zones), "n_junctions": n_junctions,
+        "n_streets": n_streets, "n_places": len(first),
+    }  # fmt: skip
+    shared = ("neighbors", "move_s", "arrival_cost_s", "states", "p_occupied")
     arrays: dict[str, NDArray[Any]] = {
-        **{
-            name: plain.arrays[name]
-            for name in ("neighbors", "move_s", "arrival_cost_s", "states", "p_occupied")
-        },
+        **{name: plain.arrays[name] for name in shared},
         **streets,
         "place_zone": lot.zone_of_slot[streets["slots"][first]],
-        **dict(zip(("place_walk_s", "place_cost_s"), bounds, strict=True)),
-        **dict(
-            zip(
-                ("onward_walk_s", "onward_cost_s"),
-                (_onward(streets, lot.n_slots, of) for of in bounds),
-                strict=True,
-            )
-        ),
+        "place_walk_s": walk,
+        "place_cost_s": cost,
+        "onward_walk_s": _onward(streets, lot.n_slots, walk),
+        "onward_cost_s": _onward(streets, lot.n_slots, cost),
         "zone_of_slot": np.ascontiguousarray(lot.zone_of_slot, np.int64),
         "forecast": np.zeros(lot.n_slots),
         "last_states": np.full(lot.n_slots, UNOBSERVED, np.uint8),
@@ -216,13 +207,8 @@ def streets_of(lot: ParkingLot, move_s: FloatArray) -> dict[str, NDArray[Any]]:
                 break
             if before == _NONE or (kind[v] != kind[before]).any():
                 place_first.append(len(at["slots"]))
-            for name, value in (
-                ("slots", v),
-                ("street_at", street),
-                ("along_s", seconds),
-                ("move_into", move),
-            ):
-                at[name].append(value)
+            for values, value in zip(at.values(), (v, street, seconds, move), strict=True):
+                values.append(value)
             before, move = v, int(onward[v])
         for name, value in (("end", v), ("length_s", seconds), ("last_move", move)):
             rows[name].append(value)
@@ -230,14 +216,11 @@ def streets_of(lot: ParkingLot, move_s: FloatArray) -> dict[str, NDArray[Any]]:
     rows["first_place"].append(len(place_first))
     place_first.append(len(at["slots"]))
     kinds = {"length_s": np.float64, "along_s": np.float64, "last_move": np.uint8, "move_into": np.uint8}
-    made = {name: np.array(values, kinds.get(name, np.int32)) for name, values in (rows | at).items()}
+    arrays = {name: np.array(values, kinds.get(name, np.int32)) for name, values in (rows | at).items()}
     position = np.zeros(n, np.int32)
-    position[made["slots"]] = np.arange(len(made["slots"]))
-    return made | {
-        "street_of": street_of,
-        "place_first": np.array(place_first, np.int32),
-        "position": position,
-    }
+    position[arrays["slots"]] = np.arange(len(arrays["slots"]))
+    first = np.array(place_first, np.int32)
+    return arrays | {"street_of": street_of, "place_first": first, "position": position}
 
 
 def _onward(streets: dict[str, NDArray[Any]], n_slots: int, bounds: FloatArray) -> FloatArray:
@@ -340,7 +323,8 @@ def _observed_slot(streets: Any, slot: int) -> tuple[Any, float, Any]:
 def _level(streets: Any, zone: int) -> float:
     """Return the factor of the odds that a slot of a zone is free: as many as were seen over those expected."""
     return float(
-        (float64s(streets.seen_free)[zone] + DOUBT) / (float64s(streets.expected_free)[zone] + DOUBT)
+        (float64s(streets.seen_free)[zone] + PRIOR_PSEUDO_COUNT)
+        / (float64s(streets.expected_free)[zone] + PRIOR_PSEUDO_COUNT)
     )
 
 
@@ -401,17 +385,8 @@ def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
             street = np.int64(street_of[junction * _N_MOVES + move])
             if street != _NONE:
                 _look_along(streets, goal, search, street, _NONE, far)
-                size = _reach(
-                    streets,
-                    end[street] - n,
-                    street,
-                    _NONE,
-                    far + length_s[street],
-                    onward_at,
-                    keys,
-                    vertices,
-                    size,
-                )
+                reached_s, end_at = far + length_s[street], end[street] - n
+                size = _reach(streets, end_at, street, _NONE, reached_s, onward_at, keys, vertices, size)
 
 
 @inlined_rule
@@ -467,15 +442,9 @@ def _reach(
 
 @rule
 def _look_along(streets: Any, goal: int, search: int, street: int, position: int, before_s: float) -> None:
-    """Compare the places along a street with the best one.
+    """Compare the places along a street, from a position on or, with -1, all, with the best one.
 
-    Args:
-        streets: the STREETS record.
-        goal: index of the problem.
-        search: address of the SEARCH record, or 0.
-        street: the street.
-        position: the first position that counts; -1: all.
-        before_s: drive to the beginning of the street, s.
+    `before_s` is the drive to the beginning of the street.
     """
     place_first, slots = int32s(streets.place_first), int32s(streets.slots)
     along_s = float64s(streets.along_s)

@@ -21,7 +21,7 @@ from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
 from parkenv.version import __version__
-from planners.model_header import CARD_KEY, read_header
+from planners.model_file import CARD_KEY, read_header
 from planners.network.features import (
     ACTION_COUNT,
     ACTION_FEATURES,

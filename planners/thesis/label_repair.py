@@ -23,16 +23,9 @@ _AFFECTED = label_setting.STOP + 1
 
 
 def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_free: FloatArray) -> int:
-    """Update a plan in place; the result equals a plan made from scratch.
+    """Update a plan in place after some slots, (k,), got other probabilities, (k,), as if it were made from scratch.
 
-    Args:
-        graph: the stopping problem of the plan.
-        labels: the plan; afterwards `labels.settled` states whether it is exact, as after `set_labels`.
-        vertices: (k,) int64, the slots whose probability changed.
-        p_free: (k,) float64, their new probabilities.
-
-    Returns:
-        The number of labels set; -1 if it was planned from scratch.
+    Return the number of labels set; -1 if it was planned from scratch. `labels.settled` is as after `set_labels`.
     """
     labels.p_free[vertices] = p_free
     reach = max(_LEAST_REACH, int(REACH * len(labels.cost)))

@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.world.lot import PARK
@@ -41,6 +41,7 @@ from planners.thesis.policy_iteration import Solution, policy_iteration
 STOP = PARK  # the move of a vertex at which to stay: to park, or because nothing is reachable
 TIE_S = 1e-7  # s: actions whose values differ by less are equally good; solvers agree to well within it
 _BUCKETS_PER_VERTEX = 2  # maximum number of buckets per vertex, so that skipping empty ones costs little
+_NEVER = np.iinfo(np.int64).max
 _REFILLS = 64  # maximum number of refills of all buckets; beyond it a heap is faster
 
 
@@ -100,17 +101,11 @@ def label_setting(mdp: ParkingMDP) -> Solution:
 
 
 def set_labels(graph: StoppingGraph, p_free: FloatArray) -> Labels:
-    """Plan by one pass of label setting.
+    """Plan by one pass of label setting; `p_free`, (n,), is kept, not copied.
 
-    Args:
-        graph: the stopping problem.
-        p_free: (n,) float64; kept, not copied.
-
-    Returns:
-        The plan; if `settled` is False, circling pays somewhere, and the costs are only upper bounds.
+    If the plan is not `settled`, circling pays somewhere, and the costs are only upper bounds.
     """
-    n = len(p_free)
-    labels = Labels(np.empty(n), np.empty(n, dtype=np.int8), p_free, settled=False)
+    labels = Labels(np.empty(len(p_free)), np.empty(len(p_free), dtype=np.int8), p_free, settled=False)
     update_labels(graph, labels)
     return labels
 
@@ -194,70 +189,60 @@ def best_moves(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray) -> ND
 
 
 @compiled(error_model="numpy")
-def _is_source(graph: StoppingGraph, cost: FloatArray, u: int) -> bool:
-    """Return whether labels may have to start from a vertex: not if one hop to a cheaper stop beats stopping.
+def _sources(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, move: NDArray[np.int8]) -> IntArray:
+    """Set every label to the cost of staying; return the vertices from which labels may have to spread.
 
-    The stop one hop away must be cheaper: otherwise, at the cost of shuttling, rounding could make two vertices each
-    leave the stop to the other.
+    None where one hop to a cheaper stop beats stopping. The stop one hop away must be cheaper: otherwise, at the cost
+    of shuttling, rounding could make two vertices each leave the stop to the other.
     """
-    own = cost[u]
-    if own == np.inf:
-        return False
-    for move in range(graph.neighbors.shape[1]):
-        v = graph.neighbors[u, move]
-        if v >= 0 and cost[v] < own and graph.move_s[u, move] + graph.gamma * cost[v] < own:
-            return False
-    return True
+    n, n_sources = len(cost), 0
+    sources = np.empty(n, np.int64)
+    for u in range(n):
+        cost[u], move[u] = stop_cost(graph, p_free, u), STOP
+    for u in range(n):
+        own = cost[u]
+        is_source = own < np.inf
+        for a in range(graph.neighbors.shape[1]):
+            v = graph.neighbors[u, a]
+            if v >= 0 and cost[v] < own and graph.move_s[u, a] + graph.gamma * cost[v] < own:
+                is_source = False
+                break
+        if is_source:
+            sources[n_sources] = u
+            n_sources += 1
+    return sources[:n_sources]
 
 
 @compiled(error_model="numpy")
 def _set_by_buckets(
     graph: StoppingGraph, p_free: FloatArray, width: float, cost: FloatArray, move: NDArray[np.int8]
 ) -> bool:
-    """Fill `cost` and `move`; bucket b holds the vertices to spread whose labels lie in [b, b + 1) times `width`.
+    """Fill `cost` and `move`; return whether the pass terminated within its limits.
 
-    Buckets are linked lists in one pool. Those beyond the last bucket wait in `later` until all buckets before
-    are empty, and then refill them.
-
-    Returns:
-        True if the pass terminated within its limits.
+    Bucket b holds the vertices to spread whose labels lie in [b, b + 1) times `width`; the last one those beyond, until
+    all before are empty, and then refills them. Buckets are linked lists in one pool.
     """
-    n = len(cost)
-    for u in range(n):
-        cost[u] = stop_cost(graph, p_free, u)
-        move[u] = STOP
-    sources, n_sources = np.empty(n, dtype=np.int32), 0
-    low, high = np.inf, -np.inf
-    for u in range(n):
-        if _is_source(graph, cost, u):
-            sources[n_sources] = u
-            n_sources += 1
-            low, high = min(low, cost[u]), max(high, cost[u])
-    if n_sources == 0:
+    n, sources = len(cost), _sources(graph, p_free, cost, move)
+    if len(sources) == 0:
         return True
+    low, high = cost[sources].min(), cost[sources].max()
     if not width > 0.0 or (high - low) / width > 1e15:
         return False
     per_s = 1.0 / width
-
-    n_buckets = int(min((high - low) * per_s, _BUCKETS_PER_VERTEX * n)) + 64
-    head = np.full(n_buckets, -1, dtype=np.int32)
+    last = int(min((high - low) * per_s, _BUCKETS_PER_VERTEX * n)) + 64
+    head = np.full(last + 1, -1, dtype=np.int32)
     # If edges climb, a vertex is spread once: each source and each edge enters at most one label.
     pool = 2 * (n + len(graph.in_s)) + 64
     entry_vertex, entry_next, used = np.empty(pool, dtype=np.int32), np.empty(pool, dtype=np.int32), 0
     to_spread = np.zeros(n, dtype=np.bool_)
-    later, first = -1, 0
-    for i in range(n_sources):
-        u = sources[i]
+    for u in sources:
         to_spread[u] = True
-        b = int((cost[u] - low) * per_s)
-        entry_vertex[used] = u
-        if b < n_buckets:
-            entry_next[used], head[b] = head[b], used
-        else:
-            entry_next[used], later = later, used
+        b = min(int((cost[u] - low) * per_s), last)
+        entry_vertex[used], entry_next[used], head[b] = u, head[b], used
         used += 1
+    first = 0
     for _ in range(_REFILLS):
-        for b in range(n_buckets):
+        for b in range(last):
             while head[b] >= 0:
                 v = entry_vertex[head[b]]
                 head[b] = entry_next[head[b]]
@@ -273,46 +258,46 @@ def _set_by_buckets(
                             return False
                         cost[u], move[u] = label, graph.in_move[e]
                         to_spread[u] = True
-                        entry_vertex[used] = u
-                        q = max(int((label - low) * per_s) - first, b)
-                        if q < n_buckets:
-                            entry_next[used], head[q] = head[q], used
-                        else:
-                            entry_next[used], later = later, used
+                        q = min(max(int((label - low) * per_s) - first, b), last)
+                        entry_vertex[used], entry_next[used], head[q] = u, head[q], used
                         used += 1
-        # Distribute the rest of `later`, starting from its smallest label.
-        first, e = np.iinfo(np.int64).max, later
-        while e >= 0:
-            if to_spread[entry_vertex[e]]:
-                first = min(first, int((cost[entry_vertex[e]] - low) * per_s))
-            e = entry_next[e]
-        e, later = later, -1
-        while e >= 0:
-            u, following = entry_vertex[e], entry_next[e]
-            if to_spread[u]:
-                b = int((cost[u] - low) * per_s) - first
-                if b < n_buckets:
-                    entry_next[e], head[b] = head[b], e
-                else:
-                    entry_next[e], later = later, e
-            e = following
-        if first == np.iinfo(np.int64).max:
+        first = _refill(head, entry_vertex, entry_next, np.where(to_spread, (cost - low) * per_s, -np.inf))
+        if first == _NEVER:
             return True
     return False
 
 
 @compiled(error_model="numpy")
+def _refill(
+    head: IntArray, entry_vertex: NDArray[np.int32], entry_next: NDArray[np.int32], place: FloatArray
+) -> int:
+    """Distribute the last bucket, from its first place on; return that, or `_NEVER` if nothing is left.
+
+    `place` is that of each vertex, (n,); -inf if it is not to be spread.
+    """
+    last = len(head) - 1
+    first, e = _NEVER, head[last]
+    while e >= 0:
+        if place[entry_vertex[e]] > -np.inf:
+            first = min(first, int(place[entry_vertex[e]]))
+        e = entry_next[e]
+    e, head[last] = head[last], -1
+    while e >= 0:
+        following = entry_next[e]
+        if place[entry_vertex[e]] > -np.inf:
+            b = min(int(place[entry_vertex[e]]) - first, last)
+            entry_next[e], head[b] = head[b], e
+        e = following
+    return first
+
+
+@compiled(error_model="numpy")
 def _set_by_heap(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, move: NDArray[np.int8]) -> bool:
     """Do the same with a heap, for climbs so small that there would be too many buckets or too wide ones."""
-    n = len(cost)
-    for u in range(n):
-        cost[u] = stop_cost(graph, p_free, u)
-        move[u] = STOP
-    room = 2 * (n + len(graph.in_s)) + 64
+    room = 2 * (len(cost) + len(graph.in_s)) + 64
     keys, vertices, size = np.empty(room), np.empty(room, dtype=np.int32), 0
-    for u in range(n):
-        if _is_source(graph, cost, u):
-            size = push(keys, vertices, size, cost[u], u)
+    for u in _sources(graph, p_free, cost, move):
+        size = push(keys, vertices, size, cost[u], u)
     return bool(spread(graph, cost, move, keys, vertices, size) >= 0)
 
 
@@ -325,18 +310,9 @@ def spread(
     vertices: NDArray[np.int32],
     size: int,
 ) -> int:
-    """Spread the labels in a heap, and those that they improve, in ascending order.
+    """Spread the `size` labels in a heap, (room,) keys and vertices, and those that they improve, in ascending order.
 
-    Args:
-        graph: the stopping problem.
-        cost: (n,), changed in place.
-        move: (n,), changed in place.
-        keys: (room,) the heap's labels.
-        vertices: (room,) their vertices.
-        size: how many there are.
-
-    Returns:
-        The number of labels entered; -1 if there was not enough room.
+    Return the number of labels entered; -1 if there was not enough room.
     """
     n_entered, room = 0, len(keys) - size
     while size > 0:

@@ -23,7 +23,7 @@ from parkenv.engine.fleet import Fleet
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import HOUR_S
-from planners.heuristics.streets import DOUBT, streets_of
+from planners.heuristics.streets import PRIOR_PSEUDO_COUNT, streets_of
 
 RULES = {"greedy-drive": (0.0, 1.0), "greedy-goal": (1.0, 1e-6), "greedy-total": (1.0, 3.0)}
 """What a second of arrival cost and one of the drive count for drivers that expect nothing of places."""
@@ -146,7 +146,7 @@ def simulate_single_driver(
             for k in range(len(size)):
                 index_s = cost_s[k] + per_drive * ahead_s[k]
                 if index_s < best_s:
-                    odds = (1.0 - p[k]) * DOUBT / (DOUBT + expected_free[zone[k]])
+                    odds = (1.0 - p[k]) * PRIOR_PSEUDO_COUNT / (PRIOR_PSEUDO_COUNT + expected_free[zone[k]])
                     chance = 1.0 - (p[k] / (p[k] + odds)) ** size[k]
                     index_s = cost_s[k] + per_drive * ahead_s[k] / chance
                     if index_s < best_s:

@@ -29,7 +29,7 @@ from parkenv.world.week import HOUR_S
 from planners.agent import ClairvoyantAgent, make_agent
 from planners.heuristics import POLICIES
 from planners.heuristics.agents import TargetAgent
-from planners.learned import LearnedAgent
+from planners.model_file import LearnedAgent
 from planners.names import EXPECTS_RIVALS
 
 _WITHOUT_NETWORK_POLICY = ("recurrent-ppo",)

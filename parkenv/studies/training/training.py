@@ -50,8 +50,7 @@ from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_c
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
-from planners.learned import LearnedAgent
-from planners.model_file import algorithm_class, save_model, slots_observed
+from planners.model_file import LearnedAgent, algorithm_class, save_model, slots_observed
 
 if TYPE_CHECKING:
     from parkenv.studies.training.spec import TrainingSpec

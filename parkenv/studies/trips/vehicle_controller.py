@@ -30,10 +30,9 @@ from parkenv.studies.trips.driven_car import (
 )
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
-from planners.driving.car_path import CarPath
+from planners.driving.car_path import CarPath, joined, rounded
 from planners.driving.hybrid_astar import SearchSettings, plan_path
-from planners.driving.lane_keeping import LaneKeeper, joined, rounded
-from planners.driving.path_tracking import PathTracker, TrackingSettings
+from planners.driving.path_tracking import LaneKeeper, PathTracker, TrackingSettings
 
 MOST_ROAD_USERS = 200  # maximum number of other cars and pedestrians
 TURN_IN_M = 9.0  # distance from the rear axle to the middle of a junction at which the turn begins, m
