@@ -148,17 +148,17 @@ def test_drivers_who_know_the_same_make_tours_of_their_own():
 
 
 def test_wrong_rates_are_refused():
-    for rate in (-1.0, float("inf"), float("nan")):
+    for rate in (-1.0, np.inf, np.nan):
         with pytest.raises(InputError, match="arrivals_per_hour is"):
             make_agent("belief-rivals", make_scenario("mini"), arrivals_per_hour=rate)
 
 
 def test_an_experiment_tells_it_the_demand():
     (scenario,) = scenario_specs("mini")
-    its = FleetStudy().changed(scenario=scenario)
+    study = FleetStudy().changed(scenario=scenario)
     for name, rate in (("belief-rivals", 120.0), ("belief-rivals(arrivals_per_hour=30)", 30.0)):
-        _, (agent, _) = its.fleet(Setting("mini", AgentSpec.of(name), "own", 0.0, 120.0))
+        _, (agent, _) = study.fleet(Setting("mini", AgentSpec.of(name), "own", 0.0, 120.0))
         assert agent.arrivals_per_hour == rate
-    sighted = its.changed(sees_cars=True)
+    sighted = study.changed(sees_cars=True)
     _, (agent, _) = sighted.fleet(Setting("mini", AgentSpec.of("belief-rivals"), "own", 0.0, 120.0))
     assert agent.arrivals_per_hour is None, "it counts the cars that it meets"

@@ -36,21 +36,17 @@ def has_large_trees(seed):
 
 
 @pytest.mark.slow
-def test_it_stays_near_the_optimum_on_small_lots():
-    gaps = np.array([gap(seed, day=False) for seed in LOTS if not has_large_trees(seed)])
-    assert len(gaps) > 12
+@pytest.mark.parametrize(("large", "least", "mean", "most"), [(False, 12, 0.02, 0.1), (True, 5, 0.5, 2.0)])
+def test_it_stays_near_the_optimum_on_small_lots(large, least, mean, most):
+    gaps = np.array([gap(seed, day=False) for seed in LOTS if has_large_trees(seed) == large])
+    assert len(gaps) > least
     assert gaps.min() > -1e-3
-    assert gaps.mean() < 0.02
-    assert np.quantile(gaps, 0.95) < 0.1
+    assert gaps.mean() < mean
+    assert np.quantile(gaps, 0.95) < most
 
 
 @pytest.mark.slow
-def test_it_stays_near_the_optimum_where_there_is_much_to_choose_and_doubting_a_right_map_costs_little():
-    gaps = np.array([gap(seed, day=False) for seed in LOTS if has_large_trees(seed)])
-    assert len(gaps) > 5
-    assert gaps.min() > -1e-3
-    assert gaps.mean() < 0.5
-    assert np.quantile(gaps, 0.95) < 2.0
+def test_doubting_a_right_map_costs_little():
     assert np.mean([gap(seed) for seed in LOTS]) < 2.0
 
 
@@ -63,6 +59,10 @@ def world(lot, taken, prior_logit=0.0, stay_s=1e9, **changes):
 
 def search(scenario, seed=0, **options):
     return EpisodeRunner(scenario, "belief", make_agent("belief", scenario, **options)).run(seed).row
+
+
+def totals_s(scenario, agent, n, options=None):
+    return np.array([row["total_s"] for row in Case(scenario, agent, options=options or {}).run(range(n))])
 
 
 # --- the environment ---------------------------------------------------------------------------------
@@ -112,13 +112,9 @@ def test_it_parks_at_once_in_an_empty_lot_that_is_known_to_be():
 def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong(day_error, ahead_s, mean_s):
     """On jam the tuned planner trusts its map into every aisle; what the first slots show is enough to doubt it."""
     scenario = make_scenario("jam", day_error=day_error)
-    ours, theirs = (
-        np.array([r["total_s"] for r in Case(scenario, name).run(range(10))])
-        for name in ("belief", "mdp-tuned")
-    )
-    _, _, high = mean_interval(ours - theirs)
-    assert high < -ahead_s
-    assert ours.mean() < mean_s
+    belief, tuned = totals_s(scenario, "belief", 10), totals_s(scenario, "mdp-tuned", 10)
+    assert mean_interval(belief - tuned)[2] < -ahead_s
+    assert belief.mean() < mean_s
 
 
 def test_it_looks_at_all_of_a_full_lot_again_and_again():
@@ -139,13 +135,8 @@ def test_it_looks_at_all_of_a_full_lot_again_and_again():
 
 
 def test_knowing_the_day_helps_the_planner_of_the_thesis_too():
-    scenario = make_scenario("jam")
-    plain, learning = (
-        np.array([r["total_s"] for r in Case(scenario, "mdp", options={"day": day}).run(range(40))])
-        for day in (False, True)
-    )
-    _, _, high = mean_interval(learning - plain)
-    assert high < -20.0
+    plain, learning = (totals_s(make_scenario("jam"), "mdp", 40, {"day": day}) for day in (False, True))
+    assert mean_interval(learning - plain)[2] < -20.0
 
 
 @pytest.mark.parametrize("level", [0.3, 0.7])
@@ -242,9 +233,10 @@ def test_looks_that_err_cost_tries_but_do_not_trap_it():
     assert max(row["failed_parks"] for row in rows) <= 5
 
 
-def test_a_bad_budget_is_refused():
-    with pytest.raises(InputError, match="budget_ms is 0"):
-        make_agent("belief", make_scenario("mini"), budget_ms=0.0)
+@pytest.mark.parametrize(("name", "value"), [("budget_ms", 0.0), ("doubt", 1.1), ("event", -0.1)])
+def test_bad_options_are_refused(name, value):
+    with pytest.raises(InputError, match=f"{name} is {value}"):
+        make_agent("belief", make_scenario("mini"), **{name: value})
 
 
 def hidden_lots(name, seen_rate, occupancy=None):

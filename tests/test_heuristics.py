@@ -34,8 +34,7 @@ def reference_target(name, problem, routes, belief, vertex, previous):
     n = problem.lot.n_slots
     seconds = routes.seconds_from(vertex)[:n]
     cost_s, reachable = problem.arrival_cost_s, np.isfinite(seconds)
-    decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
-    state = np.where((belief.state == OBSERVED_TAKEN) & decayed, 0, belief.state)
+    state = recent_state(belief)
     candidates = (state != OBSERVED_TAKEN) & reachable
     good = (state == OBSERVED_FREE) & (cost_s <= np.median(cost_s)) & reachable
     kept = previous >= 0 and state[previous] != OBSERVED_TAKEN
@@ -51,6 +50,12 @@ def reference_target(name, problem, routes, belief, vertex, previous):
     if name == "greedy-goal" or (name == "first-free" and previous < 0):
         return first(candidates, cost_s, seconds)
     return first(candidates, seconds, cost_s) if name == "greedy-drive" else first(candidates, seconds)
+
+
+def recent_state(belief):
+    """What was observed of each slot, unless the belief has forgotten that it was taken."""
+    decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
+    return np.where((belief.state == OBSERVED_TAKEN) & decayed, 0, belief.state)
 
 
 def first(slots, *keys):
@@ -72,9 +77,8 @@ def random_belief(rng, problem):
     for _ in range(rng.integers(4)):
         slots = np.flatnonzero(rng.random(n) < rng.choice([0.2, 0.6, 1.0]))
         hit, false_alarm = rng.choice([(1.0, 0.0), (0.8, 0.3)])
-        belief = belief.update(slots, rng.random(len(slots)) < 0.7, hit, false_alarm).decay(
-            rng.choice([3.0, 60.0])
-        )
+        belief = belief.update(slots, rng.random(len(slots)) < 0.7, hit, false_alarm)
+        belief = belief.decay(rng.choice([3.0, 60.0]))
     observation = belief.to_observation()
     return SlotBelief(observation["p_occupied"], observation["belief"], float(np.float32(belief.time)))
 
@@ -129,8 +133,7 @@ def test_usual_heads_for_the_place_of_the_lowest_index():
     places, n = one_way_places(problem), problem.lot.n_slots
     for vertex in rng.integers(n, problem.lot.n_vertices, 60).tolist():
         belief, seconds = random_belief(rng, problem), routes.seconds_from(vertex)
-        decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
-        state = np.where((belief.state == OBSERVED_TAKEN) & decayed, 0, belief.state)
+        state = recent_state(belief)
         indices = {s: seconds[s] + problem.arrival_cost_s[s] for s in np.flatnonzero(state == OBSERVED_FREE)}
         seen = belief.state != 0
         level = (1.0 + np.sum(belief.state == OBSERVED_FREE)) / (1.0 + np.sum(1.0 - belief.forecast[seen]))
@@ -202,12 +205,8 @@ def random_world(seed):
     scenario = Scenario(**fields, name="small", occupancy=process, sensor_model=sensor)
     demand = Demand(Headways(int(rng.integers(1, 12)), 10.0), ExponentialTime(300.0), ConstantTime(400.0))
     kind = {"knows": ("own", "shared", "full", "reserve")[seed % 4], "shares": True}
-    options = {
-        "background": ("process", "residents")[seed // 4 % 2],
-        "max_steps": 120,
-        "leave_full_lot": False,
-    }
-    return scenario, demand, kind, options
+    background = ("process", "residents")[seed // 4 % 2]
+    return scenario, demand, kind, {"background": background, "max_steps": 120, "leave_full_lot": False}
 
 
 @pytest.mark.parametrize("name", COMPILED)

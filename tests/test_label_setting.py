@@ -30,13 +30,8 @@ def random_process(seed, gamma, failure, *, shortest=0.5, wait_s=1.0, two_way=Fa
         ring = np.arange(n)
         neighbors = np.stack([(ring + 1) % n, (ring - 1) % n, np.full(n, -1), np.full(n, -1)], axis=1)
         move_s[:, 1] = np.roll(move_s[:, 0], 1)
-    kind = rng.integers(0, 4)
-    p_free = [
-        rng.choice([0.0, 1.0, *rng.random(4)], n),
-        np.zeros(n),
-        np.ones(n),
-        np.where(rng.random(n) < 0.1, 0.7, 0.0),
-    ][kind]
+    kind, some = rng.integers(0, 4), rng.choice([0.0, 1.0, *rng.random(4)], n)
+    p_free = [some, np.zeros(n), np.ones(n), np.where(rng.random(n) < 0.1, 0.7, 0.0)][kind]
     return ParkingMDP(neighbors, move_s, p_free, rng.uniform(0, 200, n), failure, wait_s, gamma)
 
 
@@ -61,14 +56,8 @@ def test_without_discount_it_is_the_shortest_way_to_a_stop():
 
 
 def test_without_discount_what_can_reach_no_slot_costs_infinity_and_waits():
-    mdp = ParkingMDP(
-        [[-1, 1, -1, -1], [-1] * 4, [0, -1, -1, -1]],
-        np.ones((3, 4)),
-        p_free=[0.5, 0.0, 0.0],
-        arrival_cost_s=[5.0, 5.0, 5.0],
-        failure_s=10.0,
-        gamma=1.0,
-    )
+    neighbors = [[-1, 1, -1, -1], [-1] * 4, [0, -1, -1, -1]]
+    mdp = ParkingMDP(neighbors, np.ones((3, 4)), [0.5, 0.0, 0.0], [5.0] * 3, failure_s=10.0, gamma=1.0)
     solution = label_setting(mdp)
     np.testing.assert_allclose(solution.values, [-10.0, -np.inf, -11.0])
     assert list(solution.policy) == [PARK, 0, 0]
@@ -264,19 +253,23 @@ def test_both_solvers_lead_to_the_same_actions(name, failure_s):
     assert replans > 0, "on an empty day a search ends without any"
 
 
-def test_agents_say_what_is_wrong():
-    scenario = make_scenario("mini")
-    with pytest.raises(InputError, match="solver is 'lp', want one of label_setting, policy_iteration"):
-        make_agent("mdp", scenario, solver="lp")
-    with pytest.raises(InputError, match="want below 1 for the solver policy_iteration"):
-        make_agent("mdp-static", scenario, gamma=1.0, solver="policy_iteration")
-    with pytest.raises(InputError, match="gamma"):
-        make_agent("mdp", scenario, gamma=0.0)
-    agent = make_agent("mdp", scenario)
-    with pytest.raises(InputError, match="p_occupied must lie"):
-        agent.solve(np.full(10, np.nan))
-    with pytest.raises(InputError, match="shape"):
-        agent.solve(np.full(11, 0.5))
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"solver": "lp"}, "solver is 'lp'"),
+        ({"gamma": 1.0, "solver": "policy_iteration"}, "gamma is 1.0"),
+        ({"gamma": 0.0}, "gamma is 0.0"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        make_agent("mdp", make_scenario("mini"), **options)
+
+
+@pytest.mark.parametrize(("n", "p"), [(10, np.nan), (11, 0.5)])
+def test_beliefs_that_are_none_are_refused(n, p):
+    with pytest.raises(InputError, match="p_occupied"):
+        make_agent("mdp", make_scenario("mini")).solve(np.full(n, p))
 
 
 def test_without_discount_the_agent_plans_in_seconds():

@@ -51,15 +51,8 @@ def parkbench_content(
         "m_origin": list(origin),
     }
     nodes = [{"nfmPolygonObjectNodes": [{"m_x": x, "m_y": y} for x, y in line]} for line in lines]
-    return {
-        "Frames": {
-            "0": {
-                "PlanningRequest": request,
-                "m_nfmOrigin": list(frame),
-                "NfmAggregatedPolygonObjects": nodes,
-            }
-        }
-    }
+    frame = {"PlanningRequest": request, "m_nfmOrigin": list(frame), "NfmAggregatedPolygonObjects": nodes}
+    return {"Frames": {"0": frame}}
 
 
 def own_text(**changes):
@@ -71,11 +64,8 @@ def own_text(**changes):
 
 def geojson_content():
     def feature(kind, shape, at, **more):
-        return {
-            "type": "Feature",
-            "properties": {"kind": kind} | more,
-            "geometry": {"type": shape, "coordinates": at},
-        }
+        geometry = {"type": shape, "coordinates": at}
+        return {"type": "Feature", "properties": {"kind": kind} | more, "geometry": geometry}
 
     features = [feature(k, "Point", p[:2], yaw=p[2]) for k, p in (("start", START), ("target", TARGET))]
     features += [feature("obstacle", "Polygon", [[*block, block[0]]]) for block in BLOCKS]
@@ -149,11 +139,14 @@ def test_the_tightest_slot_is_left_and_entered_within_all_limits(tmp_path):
     judged = made.judged
     assert judged.driven, judged
     assert judged.clearance_m > 0.001
-    states, limits = made.states, scene.vehicle
-    assert np.abs(np.diff(states[:, STEERING])).max() <= limits.steering_rate * 0.05 + 1e-9
-    assert np.abs(states[:, STEERING]).max() <= limits.max_steering
-    assert np.abs(np.diff(states[:, SPEED])).max() <= limits.max_acceleration * 0.05 + 1e-9
-    assert states[-1, SPEED] == 0.0
+    require_limits(made.states)
+    assert np.abs(made.states[:, STEERING]).max() <= TPCAP.max_steering
+    assert made.states[-1, SPEED] == 0.0
+
+
+def require_limits(states):
+    assert np.abs(np.diff(states[:, STEERING])).max() <= TPCAP.steering_rate * 0.05 + 1e-9
+    assert np.abs(np.diff(states[:, SPEED])).max() <= TPCAP.max_acceleration * 0.05 + 1e-9
 
 
 @pytest.mark.parametrize("level", SCENE_LEVELS)
@@ -242,29 +235,31 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
-    text, said = BAD[name]
+    text, wanted = BAD[name]
     if text is not None:
         (tmp_path / name).write_text(text)
     done = parkenv("park", "--cases", name, "--out", "out", cwd=tmp_path)
     assert done.returncode == 2
-    assert said in done.stderr
+    assert wanted in done.stderr
     assert name in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "wanted"),
     [
-        (("--levels", "parallel-extrem"), "parallel-extreme"),
-        (("--levels", "all", "--cases", "."), "exclude each other"),
-        (("--levels", "all", "--vehicle", "tank"), "tank"),
+        ("--levels parallel-extrem", "parallel-extreme"),
+        ("--levels all --cases .", "exclude each other"),
+        ("--levels all --vehicle tank", "tank"),
+        ("--levels oblique-normal -n 1 --shorten 1", "parkenv[optimal]"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(options, said, tmp_path):
-    done = parkenv("park", *options, "--out", "out", cwd=tmp_path)
+def test_options_that_do_not_fit_are_refused(options, wanted, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    done = parkenv(f"park {options} --out out", cwd=tmp_path)
     assert done.returncode == 2
-    assert said in done.stderr
+    assert wanted in done.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -283,21 +278,11 @@ def test_a_drive_is_shortened_until_the_deadline_and_within_the_limits():
 
     made = park(level_scene("perpendicular-normal", 0, TPCAP))
     shorter = shorten(made, 20.0)
-    judged, states = shorter.judged, shorter.states
-    assert judged.driven
-    assert judged.clearance_m >= 0.015
+    assert shorter.judged.driven
+    assert shorter.judged.clearance_m >= 0.015
     assert shorter.time_s < 0.8 * made.time_s
-    assert np.abs(np.diff(states[:, STEERING])).max() <= TPCAP.steering_rate * 0.05 + 1e-9
-    assert np.abs(np.diff(states[:, SPEED])).max() <= TPCAP.max_acceleration * 0.05 + 1e-9
+    require_limits(shorter.states)
     assert shorten(made, 0.0) is made
-
-
-def test_shortening_names_the_extra_that_it_lacks(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "casadi", None)
-    done = parkenv("park --levels oblique-normal -n 1 --shorten 1 --out out", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "parkenv[optimal]" in done.stderr
-    assert not (tmp_path / "out").exists()
 
 
 def test_an_environment_takes_a_car_by_name_and_an_agent_of_another_car_is_refused():

@@ -26,6 +26,7 @@ from planners.driving.clearance import clearance, is_collision_free, room_at
 from planners.driving.hybrid_astar import SearchSettings, plan_path, why_no_path
 from planners.driving.parking import ParkingAgent
 from planners.driving.path_tracking import PathTracker, TrackingSettings
+from planners.driving.reeds_shepp import reeds_shepp
 
 CAR = VehicleParameters()
 LOTS = ("campus", "street", "jam", "mini")
@@ -100,8 +101,6 @@ def test_a_path_leads_from_start_to_target_touches_nothing_and_can_be_steered(se
 
 
 def test_without_anything_in_the_way_the_path_is_as_good_as_the_word():
-    from planners.driving.reeds_shepp import reeds_shepp
-
     nothing = np.empty((0, 2, 2)), np.empty(0, dtype=np.int64)
     quick = SearchSettings(steer_m=0.0, change_m=0.0)
     for end in ([8.0, 3.0, 1.0], [-4.0, 2.0, 3.0], [0.0, 3.0, 0.0]):
@@ -117,13 +116,8 @@ def test_equal_problems_have_equal_paths_and_mirrored_ones_equal_length():
     np.testing.assert_array_equal(one.length, two.length)
     mirror = np.array([1.0, -1.0])
     target = task.vehicle.at_rear_axle(task.target)
-    flipped = plan_path(
-        CAR,
-        task.obstacles.corners * mirror,
-        task.obstacles.n_corners,
-        task.start[:3] * [1.0, -1.0, -1.0],
-        target * [1.0, -1.0, -1.0],
-    )
+    corners, poses = task.obstacles.corners * mirror, np.array([task.start[:3], target]) * [1.0, -1.0, -1.0]
+    flipped = plan_path(CAR, corners, task.obstacles.n_corners, *poses)
     assert flipped.driven_m == pytest.approx(one.driven_m, rel=0.25)
     assert flipped.direction_changes == one.direction_changes
 
@@ -175,11 +169,8 @@ def test_the_planner_parks(lot):
 
 def park_hundreds():
     lots = [packaged_lot(name) for name in LOTS]
-    cases = [
-        ParkingCase(lots[0], ("perpendicular",)),
-        ParkingCase(lots[0], ("oblique",)),
-        *(ParkingCase(lot) for lot in lots[1:]),
-    ]
+    cases = [ParkingCase(lots[0], (kind,)) for kind in ("perpendicular", "oblique")]
+    cases += [ParkingCase(lot) for lot in lots[1:]]
     if DRAGON_LAKE.exists():
         cases.append(ParkingCase(read_lot(DRAGON_LAKE)))
     per_case = -(-400 // len(cases))
@@ -199,9 +190,8 @@ def test_of_a_hundred_random_parkings_ninety_nine_succeed():
 
 @pytest.mark.slow
 def test_the_planner_waits_for_those_who_move():
-    env = gym.make(
-        "parkenv/Drive-v1", lot="campus", obstacle_map=True, traffic=Traffic(cars=6, pedestrians=10)
-    )
+    traffic = Traffic(cars=6, pedestrians=10)
+    env = gym.make("parkenv/Drive-v1", lot="campus", obstacle_map=True, traffic=traffic)
     rows = [park_once(env, ParkingAgent(), seed).row for seed in range(8)]
     assert all(row["reason"] in ("", "out of time") for row in rows)
     assert sum(row["parked"] for row in rows) >= 6
@@ -217,9 +207,8 @@ def test_an_observation_without_the_map_is_refused():
 @pytest.mark.parametrize("change", [{"length": 4.9}, {"wheelbase": 2.9}, {"max_steering": 0.5}])
 def test_what_is_made_for_a_vehicle_refuses_another_one(change):
     other = VehicleParameters(**change)
-    env = gym.make(
-        "parkenv/Drive-v1", lot="campus", kinds=("perpendicular",), vehicle=other, obstacle_map=True
-    )
+    kinds = ("perpendicular",)
+    env = gym.make("parkenv/Drive-v1", lot="campus", kinds=kinds, vehicle=other, obstacle_map=True)
     observation, _ = env.reset(seed=0)
     ((name, value),) = change.items()
     refused = f"vehicle with {name} {getattr(VehicleParameters(), name):g}, this one has {value:g}"
@@ -249,9 +238,9 @@ def test_where_no_path_is_the_car_stays_and_that_is_said():
 @pytest.mark.parametrize(("blocked", "where"), [((0.0, 0.0), "in the slot"), ((9.0, 0.0), "where it stands")])
 def test_a_pose_without_room_is_named(blocked, where):
     box = np.array([[-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]])[None] + np.array(blocked)
-    its = (VehicleParameters(), box, np.array([4]), np.array([9.0, 0.0, 0.0]), np.zeros(3))
-    assert plan_path(*its) is None
-    assert f"would touch an obstacle {where}" in why_no_path(*its)
+    task = (VehicleParameters(), box, np.array([4]), np.array([9.0, 0.0, 0.0]), np.zeros(3))
+    assert plan_path(*task) is None
+    assert where in why_no_path(*task)
 
 
 def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
@@ -270,17 +259,15 @@ def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("settings", "name", "value"),
     [
-        (lambda: SearchSettings(greed=0.5), "search greed is 0.5, want at least 1"),
-        (lambda: SearchSettings(attempts=()), "search attempts are"),
-        (lambda: SearchSettings(most_expansions=0), "most_expansions is 0"),
-        (lambda: TrackingSettings(speed=0.0), "tracking speed is 0.0, want above 0"),
+        (SearchSettings, "greed", 0.5), (SearchSettings, "attempts", ()), (SearchSettings, "most_expansions", 0),
+        (TrackingSettings, "speed", 0.0),
     ],
-)
-def test_settings_out_of_range_are_refused(make, message):
-    with pytest.raises(InputError, match=message):
-        make()
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(settings, name, value):
+    with pytest.raises(InputError, match=name):
+        settings(**{name: value})
 
 
 def test_park_writes_its_table_and_pictures(tmp_path):

@@ -21,10 +21,10 @@ COSTS = (1.0, 4.0, 16.0, 64.0)
 def test_the_simulation_agrees_with_the_planner_itself(seed):
     """Its mean over worlds is the planner's exact expectation, up to sampling error."""
     problem, p, entry = small_lot(seed)
-    found = tune_failure_cost(problem, p, entry, costs=COSTS, worlds=4000, seed=1)
+    tuning = tune_failure_cost(problem, p, entry, costs=COSTS, worlds=4000, seed=1)
     exact = [expected_time(make_agent("mdp", problem, failure_s=c), problem, p, entry) for c in COSTS]
-    np.testing.assert_allclose(found.mean_s, exact, rtol=0.05)
-    assert exact[COSTS.index(found.best)] <= min(exact) * 1.03
+    np.testing.assert_allclose(tuning.mean_s, exact, rtol=0.05)
+    assert exact[COSTS.index(tuning.best)] <= min(exact) * 1.03
 
 
 @pytest.mark.parametrize(
@@ -79,13 +79,18 @@ def test_it_is_the_planner_of_the_thesis_at_the_chosen_cost():
         assert row == plain
 
 
-def test_what_cannot_be_simulated_is_refused():
+@pytest.mark.parametrize(
+    ("n", "options", "message"),
+    [
+        (12, {"worlds": 0}, "worlds is 0"),
+        (12, {"costs": (0.0, 1.0)}, "costs"),
+        (4, {}, "p_occupied has shape"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(n, options, message):
     problem, p, entry = small_lot(0)
-    with pytest.raises(InputError, match="worlds is 0"):
-        tune_failure_cost(problem, p, entry, worlds=0)
-    with pytest.raises(InputError, match="worlds is 0"):
-        make_agent("mdp-tuned", problem, worlds=0)
-    with pytest.raises(InputError, match="above 0"):
-        tune_failure_cost(problem, p, entry, costs=(0.0, 1.0))
-    with pytest.raises(InputError, match="want 12 probabilities"):
-        tune_failure_cost(problem, p[:4], entry)
+    with pytest.raises(InputError, match=message):
+        tune_failure_cost(problem, p[:n], entry, **options)
+    if "worlds" in options:
+        with pytest.raises(InputError, match=message):
+            make_agent("mdp-tuned", problem, **options)
