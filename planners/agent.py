@@ -100,18 +100,7 @@ class SearchAgent(ABC, Generic[Memory]):
             raise InputError(
                 f'observation holds {", ".join(observation)}, want one of parkenv/Search-v2 with observation="full"'
             )
-        if np.ndim(observation["vertex"]) == 0:
-            if episode_start is not None and np.any(episode_start):
-                state = None
-            return self._predict_one(observation, state)  # type: ignore[arg-type]
-        n = len(observation["vertex"])
-        memories: list[Any] = [None] * n if state is None else list(state)  # type: ignore[arg-type]
-        actions = np.empty(n, dtype=np.int64)
-        for i in range(n):
-            single = {key: values[i] for key, values in observation.items()}
-            starts = episode_start is not None and bool(episode_start[i])
-            actions[i], memories[i] = self._predict_one(single, None if starts else memories[i])
-        return actions, memories
+        return predict_each(self._predict_one, observation, "vertex", 0, state, episode_start)
 
     def _predict_one(
         self, observation: Observation, memory: Memory | None
@@ -136,6 +125,32 @@ class SearchAgent(ABC, Generic[Memory]):
         """
         del observation, action, memory
         return PlanPreview()
+
+
+def predict_each(
+    predict_one: Callable[[Observation, Any], tuple[Any, Any]],
+    observation: Observation,
+    key: str,
+    n_axes: int,
+    state: Any,
+    episode_start: Any,
+) -> tuple[Any, Any]:
+    """Predict for one observation, whose entry `key` has `n_axes`, or for each of a batch; without a state at a start.
+
+    Return the actions, one or with a leading axis, and the states.
+    """
+    if np.ndim(observation[key]) == n_axes:
+        starts = episode_start is not None and np.any(episode_start)
+        return predict_one(observation, None if starts else state)
+    n = len(observation[key])
+    states = [None] * n if state is None else list(state)
+    actions = []
+    for i in range(n):
+        single = {name: values[i] for name, values in observation.items()}
+        starts = episode_start is not None and bool(episode_start[i])
+        action, states[i] = predict_one(single, None if starts else states[i])
+        actions.append(action)
+    return np.array(actions), states
 
 
 def belief_for_decision(observation: Observation) -> SlotBelief:

@@ -59,7 +59,6 @@ class HumanAgent(SearchAgent[Iterator[int]]):
             raise InputError(f"{path}: worlds has a world twice, want each once")
 
     def begin(self, observation: Observation, belief: SlotBelief) -> Iterator[int]:
-        """Return the person's actions in this world."""
         del belief
         start = (np.float32(observation["time"][0]), int(observation["vertex"]))
         if start not in self._actions:
@@ -69,7 +68,6 @@ class HumanAgent(SearchAgent[Iterator[int]]):
         return map(int, self._actions[start])
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: Iterator[int]) -> int:
-        """Return the next action."""
         del observation, belief
         if (action := next(memory, None)) is None:
             raise InputError(f"{self.name}: actions end before the search does")

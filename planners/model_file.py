@@ -81,7 +81,6 @@ class BoxSpace(Spec):
 
     @classmethod
     def of(cls, space: spaces.Space[Any]) -> Self:
-        """Describe a space."""
         if not isinstance(space, spaces.Box):
             raise InputError(f"the model has a space {space}, want boxes of numbers")
         low, high = (
@@ -91,7 +90,6 @@ class BoxSpace(Spec):
         return cls.parse(content, "space of the model")
 
     def box(self) -> spaces.Box:
-        """Make the space."""
         low = -np.inf if self.low is None else self.low
         high = np.inf if self.high is None else self.high
         return spaces.Box(low, high, self.shape, np.dtype(self.dtype).type)
@@ -180,7 +178,6 @@ class ModelCard(_WithNulls):
 
 
 def algorithm_class(name: str) -> Any:
-    """Return the stable-baselines3 class of an algorithm."""
     if name not in ALGORITHMS:
         raise InputError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
     module, class_name = ALGORITHMS[name]
@@ -295,7 +292,6 @@ def _require_spaces(card: ModelCard, path: str | os.PathLike[str]) -> None:
 
 
 def _no_rate(progress: float) -> float:
-    """Return the rate of a model that is not trained further."""
     return 0.0 * progress
 
 

@@ -12,7 +12,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -68,13 +68,11 @@ class ModelAgent(SearchAgent[ModelSearch]):
         del belief
         before, action = memory.belief, memory.action
         if action is not None:
-            goes_on = self.problem.edges["target"][before.vertex, action] == observation["vertex"]
             # Among many cars one may have to wait, and then stands where its action did not lead.
-            memory.belief = (
-                self.model.update(before, action, observation)
-                if goes_on
-                else self.model.initial_belief(observation)
-            )
+            if self.problem.edges["target"][before.vertex, action] == observation["vertex"]:
+                memory.belief = self.model.update(before, action, observation)
+            else:
+                memory.belief = self.model.initial_belief(observation)
         here = int(observation["vertex"])
         actions = np.flatnonzero(observation["action_mask"])
         if here < self.problem.lot.n_slots and memory.belief.slots.p_occupied[here] > _SURELY_TAKEN:
@@ -126,16 +124,16 @@ class RolloutAgent(ModelAgent):
         if budget_ms is not None:
             require_number("budget_ms", budget_ms, above=0.0)
         self.simulations, self.budget_ms = simulations, budget_ms
-        self._base: _Base = (
+        self._base = (
             _Planner(self.model, BeliefAgent(self.problem), ahead)
             if base == BELIEF
             else _Heuristic(self.model, POLICIES[base])
         )
 
     def begin(self, observation: Observation, belief: SlotBelief) -> ModelSearch:
-        """Start with the forecast."""
         memory = super().begin(observation, belief)
-        memory.base = self._base.begin(observation, belief)
+        if isinstance(self._base, _Planner):
+            memory.base = self._base.planner.begin(observation, belief)
         return memory
 
     def choose(self, actions: IntArray, memory: ModelSearch) -> int:
@@ -149,8 +147,8 @@ class RolloutAgent(ModelAgent):
             for n in self._batches(len(actions), rounds):
                 cost_s = np.hstack([cost_s, self._costs_s(actions, base, memory, n)])
             better = np.argsort(cost_s.mean(axis=1), kind="stable")[: (len(actions) + 1) // 2]
-            kept = np.union1d(better, np.flatnonzero(actions == base))
-            actions, cost_s = actions[kept], cost_s[kept]
+            left = np.union1d(better, np.flatnonzero(actions == base))
+            actions, cost_s = actions[left], cost_s[left]
         best = int(cost_s.mean(axis=1).argmin())
         for saved_s in cost_s[actions == base] - cost_s[best]:
             # Chance would let it drive to and fro.
@@ -176,28 +174,12 @@ class RolloutAgent(ModelAgent):
         return self._base.costs_s(worlds, np.repeat(actions, n), base, memory).reshape(len(actions), n)
 
 
-class _Base(Protocol):
-    """What drives on after the first action."""
-
-    def begin(self, observation: Observation, belief: SlotBelief) -> BeliefSearch | None:
-        """Return its memory, if it has one."""
-
-    def decide(self, memory: ModelSearch) -> int:
-        """Return what it would do now."""
-
-    def costs_s(self, worlds: Simulations, first: IntArray, base: int, memory: ModelSearch) -> FloatArray:
-        """Return the cost of simulated searches with these first actions, (n,) s; its own would be `base`."""
-
-
 @dataclass
 class _Heuristic:
-    """A compiled heuristic."""
+    """A compiled heuristic as what drives on after the first action."""
 
     model: Model
     policy: CompiledPolicy
-
-    def begin(self, observation: Observation, belief: SlotBelief) -> None:
-        del observation, belief
 
     def decide(self, memory: ModelSearch) -> int:
         return int(self.model.sample(memory.belief, memory.rng).choose(self.policy)[0])
@@ -209,26 +191,19 @@ class _Heuristic:
 
 @dataclass
 class _Planner:
-    """`belief`."""
+    """`belief` as what drives on; `base` is the first action that it would take itself."""
 
     model: Model
     planner: BeliefAgent
     ahead: int
-
-    def begin(self, observation: Observation, belief: SlotBelief) -> BeliefSearch:
-        return self.planner.begin(observation, belief)
 
     def decide(self, memory: ModelSearch) -> int:
         assert memory.base is not None
         return self.planner.decide({"vertex": memory.belief.vertex}, memory.belief.slots, memory.base)
 
     def costs_s(self, worlds: Simulations, first: IntArray, base: int, memory: ModelSearch) -> FloatArray:
-        return np.array(
-            [
-                self._cost_s(worlds.one(i), int(action), action == base, memory)
-                for i, action in enumerate(first)
-            ]
-        )
+        cost_s = (self._cost_s(worlds.one(i), int(a), a == base, memory) for i, a in enumerate(first))
+        return np.fromiter(cost_s, np.float64, len(first))
 
     def _cost_s(self, world: Simulations, action: int, on_path: bool, memory: ModelSearch) -> float:
         """Return the cost of one simulated search, s, that begins with an action."""

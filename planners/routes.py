@@ -171,7 +171,6 @@ class RoadTable:
 
     @classmethod
     def of(cls, problem: SearchProblem) -> Self:
-        """Make the table of the whole lot."""
         return cls(problem.lot.neighbors, problem.move_cost_s)
 
     @property

@@ -70,8 +70,6 @@ class Crowd(NamedTuple):
 
 @dataclass
 class BeliefSearch:
-    """Memory of an episode."""
-
     # the part of the lot that is planned for. The arrays below cover its slots, in its numbering.
     near: Neighborhood
     crowd: Crowd
@@ -194,7 +192,6 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         self._follow_best_path(int(near.vertices[0]), 0, belief.take(near.slots), memory)
 
     def begin(self, observation: Observation, belief: SlotBelief) -> BeliefSearch:
-        """Choose the part of the lot to search."""
         vertex = int(observation["vertex"])
         crowd = Crowd(float(observation["time"][0])).after(observation)
         memory = self._search_of(self._neighborhoods.toward(vertex), belief, crowd)

@@ -451,7 +451,6 @@ class ExactAgent(SearchAgent[ExactState]):
         self.table = RoadTable.of(self.problem)
 
     def begin(self, observation: Observation, belief: SlotBelief) -> ExactState:
-        """Solve from the forecast."""
         return ExactState(belief, self._solve(belief, int(observation["vertex"])))
 
     def _solve(self, before: SlotBelief, vertex: int, *observed: NDArray[np.bool_]) -> ExactSolution:

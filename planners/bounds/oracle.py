@@ -111,11 +111,9 @@ class OracleAgent(SearchAgent[OracleState]):
         self._time = 0.0
 
     def prepare(self, world: World, time: float) -> None:
-        """Receive the world of the next episode and its start time, s since Monday 00:00."""
         self._world, self._time = world, time
 
     def begin(self, observation: Observation, belief: SlotBelief) -> OracleState:
-        """Choose a slot, or decide to prove the lot full."""
         del belief
         if self._world is None:
             raise RuntimeError("the oracle was not shown the world: call prepare(world, time) after reset()")
@@ -153,7 +151,6 @@ class OracleAgent(SearchAgent[OracleState]):
         return PARK if self._world.next_free(np.array([vertex]), now)[0] <= now else wait
 
     def plan_preview(self, observation: Observation, action: int, memory: OracleState) -> PlanPreview:
-        """Return the shortest route to the slot."""
         del action
         return PlanPreview(self.routes.path(int(observation["vertex"]), memory.slot))
 

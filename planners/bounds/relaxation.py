@@ -387,7 +387,6 @@ def _best_revealed(known: int, left_s: NDArray[np.float32], news: _News, reveale
 
 @compiled(error_model="numpy")
 def _set_of(state: int, ways: _Ways) -> int:
-    """Return the set of a state."""
     return int(ways.sets[np.searchsorted(ways.first, state, side="right") - 1])
 
 

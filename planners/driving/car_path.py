@@ -34,8 +34,7 @@ class CarPath:
     @property
     def direction_changes(self) -> int:
         """Number of changes between forward and backward."""
-        sign = np.sign(self.length[np.abs(self.length) > SHORTEST_ARC])
-        return int((sign[1:] != sign[:-1]).sum())
+        return count_changes(self.length[np.abs(self.length) > SHORTEST_ARC])
 
     @property
     def turned_rad(self) -> float:
@@ -59,6 +58,11 @@ class CarPath:
             curvature += [bend] * n
             direction += [math.copysign(1.0, length)] * n
         return np.array(poses), np.array(curvature), np.array(direction)
+
+
+def count_changes(values: FloatArray) -> int:
+    """Return how often the sign changes from one value to the next, (n,)."""
+    return int(np.count_nonzero(np.diff(np.sign(values))))
 
 
 def rounded(points: FloatArray, radius: float) -> CarPath:

@@ -17,7 +17,7 @@ from parkenv.driving.crossings import CrossingTraffic, caused_contact
 from parkenv.driving.encounters import encounter_times
 from parkenv.driving.scene import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, FootprintCheck, Scene
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
-from planners.driving.car_path import CarPath
+from planners.driving.car_path import CarPath, count_changes
 from planners.driving.clearance import Clearance, clearance, room_at
 from planners.driving.hybrid_astar import WINDOW_M, SearchSettings, plan_path
 from planners.driving.path_tracking import PathTracker, TrackingSettings
@@ -82,8 +82,7 @@ class Manoeuvre:
     @property
     def direction_changes(self) -> int:
         """Number of changes between forward and backward."""
-        sign = np.sign(self.states[self.states[:, SPEED] != 0.0, SPEED])
-        return int((sign[1:] != sign[:-1]).sum())
+        return count_changes(self.states[self.states[:, SPEED] != 0.0, SPEED])
 
     @cached_property
     def judged(self) -> Judgement:
@@ -129,7 +128,7 @@ def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None)
         plan: yields paths; `paths_in_scene` if None.
     """
     paths, planning_s, tried = (plan or paths_in_scene)(scene), 0.0, list[Manoeuvre]()
-    while not any(made.judged.driven for made in tried):
+    while not any(manoeuvre.judged.driven for manoeuvre in tried):
         began = time.perf_counter()
         path = next(paths, None)
         planning_s += time.perf_counter() - began

@@ -15,6 +15,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.encounters import encounter_times
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
+from planners.agent import predict_each
 from planners.driving.car_path import CarPath
 from planners.driving.hybrid_astar import SearchSettings, plan_path, why_no_path
 from planners.driving.path_tracking import PathTracker, TrackingSettings
@@ -103,13 +104,13 @@ class ParkingAgent:
         """
         del deterministic
         self.require_map(observation)
-        if np.ndim(observation["achieved_goal"]) == 1:
-            start = None if episode_start is None else [bool(np.any(episode_start))]
-            several = {key: np.asarray(values)[None] for key, values in observation.items()}
-            actions, memories = self._decide_all(several, [state], start)
-            return actions[0], memories[0]
-        before = [None] * len(observation["achieved_goal"]) if state is None else list(state)
-        return self._decide_all(observation, before, episode_start)
+        return predict_each(self._predict_one, observation, "achieved_goal", 1, state, episode_start)
+
+    def _predict_one(
+        self, observation: Observation, memory: ParkingMemory | None
+    ) -> tuple[NDArray[np.float32], ParkingMemory]:
+        memory = memory or ParkingMemory()
+        return self._decide(observation, memory), memory
 
     def require_map(self, observation: Observation) -> None:
         """Raise an `InputError` unless observations have the obstacle map and are of the agent's own vehicle."""
@@ -119,17 +120,6 @@ class ParkingAgent:
                     f"the observation has no {key!r}: make the environment with obstacle_map=True"
                 )
         self.vehicle.require_same(observation["vehicle"], f"agent {self.name!r}")
-
-    def _decide_all(
-        self, observation: Observation, memories: list[Any], start: Any
-    ) -> tuple[NDArray[np.float32], list[ParkingMemory]]:
-        """Return the actions, (n, 2) float32, and the memories; a memory is None where an episode begins."""
-        actions = np.empty((len(memories), 2), dtype=np.float32)
-        for i in range(len(memories)):
-            if memories[i] is None or (start is not None and start[i]):
-                memories[i] = ParkingMemory()
-            actions[i] = self._decide({key: values[i] for key, values in observation.items()}, memories[i])
-        return actions, memories
 
     def plan(self, observation: Observation, *, around_others: bool = False) -> CarPath | None:
         """Plan a path from the current pose to the desired one, in the slot's frame; return None if none was found.
@@ -205,7 +195,6 @@ class ParkingAgent:
 
 
 def _pose(goal: NDArray[np.float32]) -> FloatArray:
-    """Return the pose, (3,) x, y in m and yaw in rad, of a goal."""
     return np.array([float(goal[0]), float(goal[1]), math.atan2(float(goal[3]), float(goal[2]))])
 
 

@@ -217,7 +217,6 @@ def follow(vehicle: VehicleParameters, reference: Reference, start: FloatArray) 
 
 
 def _at(time_s: FloatArray, knots: FloatArray, at: float) -> FloatArray:
-    """Interpolate a reference."""
     return np.array([np.interp(at, time_s, column) for column in knots.T])
 
 

@@ -62,7 +62,6 @@ class TargetAgent(SearchAgent[GreedyState]):
         return {name: value for name, value in vars(self).items() if name != "_tables"}
 
     def begin(self, observation: Observation, belief: SlotBelief) -> GreedyState:
-        """Start without a target."""
         del observation, belief
         return GreedyState(np.zeros(2 * self.problem.lot.n_vertices, np.uint8))
 
@@ -87,7 +86,6 @@ class TargetAgent(SearchAgent[GreedyState]):
         return int(memory.moves[memory.n_moves])
 
     def plan_preview(self, observation: Observation, action: int, memory: GreedyState) -> PlanPreview:
-        """Return the shortest route to the target."""
         path = [int(observation["vertex"])]
         moves = [] if action == PARK else [action, *memory.moves[: memory.n_moves][::-1]]
         for move in moves:
@@ -189,7 +187,6 @@ class UsualAgent(TargetAgent):
         return self._next_action(vertex, memory)
 
     def compiled_policy(self) -> CompiledPolicy:
-        """Return the policy that decides as this agent for the cars of a fleet, without Python."""
         return UsualPolicy()
 
 
@@ -212,6 +209,5 @@ class RandomAgent(SearchAgent[np.random.Generator]):
         return np.random.default_rng([self.seed, moment, int(observation["vertex"])])
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: np.random.Generator) -> int:
-        """Choose one of the actions that the mask allows."""
         del belief
         return int(memory.choice(np.flatnonzero(observation["action_mask"])))

@@ -95,7 +95,6 @@ class TargetPolicy(CompiledPolicy):
         self.heuristic, self.within_m = heuristic, within_m
 
     def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
-        """Return the policy's tables for a fleet."""
         return heuristic_tables(self.heuristic, problems, self.within_m)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -109,7 +108,6 @@ class UsualPolicy(CompiledPolicy):
         super().__init__("usual", decide_usual)
 
     def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
-        """Return the streets of the lot."""
         return street_tables(problems)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -213,7 +213,6 @@ def _n_known(tables: Any, search: int) -> int:
 
 @inlined_rule
 def _known_slot(search: int, i: int) -> int:
-    """Return the i-th of these slots."""
     return int(known_slot(search_of(search), i) if search else i)
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, UNOBSERVED, SlotBelief
 from parkenv.compiled.arrays import FloatArray
-from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation
 from planners.belief.agent import BeliefAgent, BeliefSearch, Crowd, snapshot
@@ -26,7 +25,7 @@ from planners.network.features import (
     Situation,
     observe,
 )
-from planners.network.lookahead import Scratch
+from planners.network.lookahead import Outlook, Scratch
 from planners.network.policy import SHIPPED, NetworkPolicy
 
 CIRCLING = 0.1
@@ -38,8 +37,6 @@ HARDLY_ANY = 0.1
 
 @dataclass
 class NetworkSearch(BeliefSearch):
-    """Memory of an episode."""
-
     previous: int = -1  # the vertex before, in the lot
     # (n_vertices,) float64, s since the search began, the last visit of each vertex of the part; -1 without one
     visited_at: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -114,7 +111,6 @@ class NetworkAgent(BeliefAgent):
         )
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
-        """Update the memory, score the actions and take the best."""
         self.last_features = self.last_scores = None
         return super().decide(observation, belief, memory)
 
@@ -143,10 +139,9 @@ class NetworkAgent(BeliefAgent):
         near, out = memory.near, self._features
         assert memory.graph is not None
         assert memory.scratch is not None
-        following = np.full(len(MOVES), -1)
-        for a in range(len(MOVES)):
-            if (end := int(self._neighbors[vertex, a])) >= 0:
-                following[a] = near.index(end)
+        following = np.array(
+            [near.index(end) if end >= 0 else -1 for end in self._neighbors[vertex].tolist()]
+        )
         waits = (self._neighbors[vertex] < 0).any()
         now = Situation(
             here,
@@ -160,7 +155,9 @@ class NetworkAgent(BeliefAgent):
             known.forecast.astype(np.float64),
             known.observed_at.astype(np.float64),
         )
-        observe(now, memory.by_cost, self._failure_costs, memory.graph, belief, memory.scratch, out)
+        nothing = np.empty(0, np.int64)
+        outlook = Outlook(memory.by_cost, nothing, np.inf, memory.graph, belief, memory.scratch)
+        observe(now, self._failure_costs, outlook, out)
         return out
 
     def _circling(self, vertex: int, here: int, memory: NetworkSearch) -> FloatArray:
@@ -170,8 +167,7 @@ class NetworkAgent(BeliefAgent):
             memory.visits[:] = 0.0
             memory.n_known = n_known
         cost = np.zeros(ACTION_COUNT)
-        for a in range(len(MOVES)):
-            end = int(self._neighbors[vertex, a])
+        for a, end in enumerate(self._neighbors[vertex].tolist()):
             if end >= 0 and (i := memory.near.index(end)) >= 0:
                 cost[a] = CIRCLING * memory.visits[i]
         cost[[PARKING, WAITING]] = CIRCLING * memory.visits[here]

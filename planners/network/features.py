@@ -20,8 +20,8 @@ from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from planners.belief.path import expected_cost_to_slot, options_at_hand
-from planners.belief.planning_graph import BeliefSnapshot, PlanningGraph, is_hidden, needs_attempt
-from planners.network.lookahead import Scratch, best_option, next_target, path_value
+from planners.belief.planning_graph import BeliefSnapshot, is_hidden, needs_attempt
+from planners.network.lookahead import Outlook, best_option, next_target, path_value
 
 ACTION_COUNT = 6
 """Four moves, parking, waiting."""
@@ -92,7 +92,6 @@ class Features(NamedTuple):
 
     @classmethod
     def empty(cls) -> Features:
-        """Allocate the observation of one decision."""
         return cls(
             np.zeros((ACTION_COUNT, ACTION_FEATURES), np.float32),
             np.zeros((ACTION_COUNT, CANDIDATES, TOKEN_FEATURES), np.float32),
@@ -119,28 +118,10 @@ def _logit(p: float) -> float:
 
 
 @compiled(error_model="numpy")
-def observe(
-    now: Situation,
-    by_cost: IntArray,
-    failure_costs: FloatArray,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-    scratch: Scratch,
-    out: Features,
-) -> None:
-    """Write the network's observation of a decision.
-
-    Args:
-        now: the situation.
-        by_cost: (n_slots,) the slots, least arrival cost first.
-        failure_costs: (k,) s, `FAILURE_COSTS`.
-        graph: the lot, or a part of it.
-        belief: the belief about its slots.
-        scratch: buffers.
-        out: output.
-    """
-    here, n = now.here, len(belief.slots)
-    n_costs = len(failure_costs)
+def observe(now: Situation, failure_costs: FloatArray, outlook: Outlook, out: Features) -> None:
+    """Write the network's observation of a decision, given `FAILURE_COSTS` and an outlook without options."""
+    graph, belief = outlook.graph, outlook.belief
+    here, n, n_costs = now.here, len(belief.slots), len(failure_costs)
     ends, step_s = np.full(ACTION_COUNT, -1), np.full(ACTION_COUNT, np.inf)
     for a in range(PARKING):
         ends[a] = now.following[a]
@@ -152,26 +133,22 @@ def observe(
     if now.wait_s < np.inf:
         ends[WAITING], step_s[WAITING] = here, now.wait_s
 
-    _, fallback_s = next_target(
-        here, 0.0, failure_costs[n_costs // 2], by_cost, scratch.seen_at, graph, belief
-    )
+    _, fallback_s = next_target(here, 0.0, failure_costs[n_costs // 2], outlook)
     fallback_s = min(fallback_s, graph.give_up_s)
     options = options_at_hand(here, fallback_s, MOST_OPTIONS, graph, belief)
+    outlook = Outlook(outlook.by_cost, options, fallback_s, graph, belief, outlook.scratch)
     path_s, p_none = np.full((ACTION_COUNT, n_costs), np.inf), np.ones((ACTION_COUNT, n_costs))
     first, option_s = np.full((ACTION_COUNT, n_costs), -1), np.full(ACTION_COUNT, np.inf)
     for a in range(ACTION_COUNT):
         out.allowed[a] = ends[a] >= 0
         if ends[a] < 0 or a == PARKING:
             continue
-        option_s[a] = step_s[a] + best_option(ends[a], step_s[a], options, fallback_s, graph, belief)
+        option_s[a] = step_s[a] + best_option(ends[a], step_s[a], outlook)
         for c in range(n_costs):
             path_s[a, c], p_none[a, c], first[a, c] = path_value(
-                ends[a], step_s[a], failure_costs[c], by_cost, options, fallback_s, graph, belief, scratch
+                ends[a], step_s[a], failure_costs[c], outlook
             )
-    best_path_s = np.full(n_costs, np.inf)
-    for c in range(n_costs):
-        for a in range(ACTION_COUNT):
-            best_path_s[c] = min(best_path_s[c], path_s[a, c])
+    best_path_s = np.array([path_s[:, c].min() for c in range(n_costs)])
     least_s = min(best_path_s.min(), option_s.min(), graph.give_up_s)
     if ends[PARKING] >= 0:
         p_here = belief.slots[here].p_free
@@ -180,13 +157,10 @@ def observe(
     scale = max(least_s, LEAST_SCALE)
     least_option_s = option_s.min()
 
-    n_observed, n_actions, p_free_mean = 0, 0, 0.0
+    n_observed, n_actions, p_free_sum = (now.observed_at >= 0.0).sum(), out.allowed.sum(), 0.0
     for s in range(n):
-        n_observed += int(now.observed_at[s] >= 0.0)
-        p_free_mean += belief.slots[s].p_free
-    for a in range(ACTION_COUNT):
-        n_actions += int(out.allowed[a])
-    candidates = _candidates(here, by_cost, failure_costs, graph, belief)
+        p_free_sum += belief.slots[s].p_free
+    candidates = _candidates(here, failure_costs, outlook)
     shift, spread = _day_of_slots(candidates, now, belief)
     nearest_rate = belief.slots[candidates[0]].decay_rate if candidates[0] >= 0 else 0.0
 
@@ -199,30 +173,25 @@ def observe(
         end = ends[a]
         value = min(path_s[a].min(), option_s[a])
         out.lookahead_s[a] = min(value, step_s[a] + graph.give_up_s)
-        row[IS_MOVE] = 1.0 if a < PARKING else 0.0
-        row[IS_PARKING] = 1.0 if a == PARKING else 0.0
-        row[IS_WAITING] = 1.0 if a == WAITING else 0.0
+        row[IS_MOVE], row[IS_PARKING], row[IS_WAITING] = a < PARKING, a == PARKING, a == WAITING
         row[DURATION] = _squashed(step_s[a] / scale)
-        row[IS_RETURN] = 1.0 if a < PARKING and end == now.previous else 0.0
+        row[IS_RETURN] = a < PARKING and end == now.previous
         if a < PARKING and now.visited_at[end] >= 0.0:
             row[LAST_VISIT] = 1.0 - _squashed((now.time - now.visited_at[end]) / scale)
         row[LOOKAHEAD] = _regret(out.lookahead_s[a], least_s, scale)
         row[KNOWN_FREE] = _squashed(option_s[a] / scale)
-        row[KNOWN_FREE_REGRET] = (
-            _regret(option_s[a], least_option_s, scale) if least_option_s < np.inf else 0.0
-        )
+        if least_option_s < np.inf:
+            row[KNOWN_FREE_REGRET] = _regret(option_s[a], least_option_s, scale)
         if end < n:
             row[END_P_FREE] = belief.slots[end].p_free
-            row[END_UNOBSERVED] = 1.0 if belief.slots[end].state == UNOBSERVED else 0.0
+            row[END_UNOBSERVED] = belief.slots[end].state == UNOBSERVED
             row[END_COST] = _squashed(graph.cost_s[end] / scale)
         if a != PARKING:
             new, n_new = 0.0, 0
             for i in range(graph.view_starts[end], graph.view_starts[end + 1]):
-                view = graph.views[i]
-                if belief.slots[view.slot].state == UNOBSERVED and not is_hidden(
-                    view.slot, view.rate, belief
-                ):
-                    new += belief.slots[view.slot].p_free
+                s, rate = graph.views[i].slot, graph.views[i].rate
+                if belief.slots[s].state == UNOBSERVED and not is_hidden(s, rate, belief):
+                    new += belief.slots[s].p_free
                     n_new += 1
             row[VIEW_P_FREE], row[VIEW_SLOTS] = _squashed(new), _squashed(0.25 * n_new)
             row[DRIVE_BACK] = _squashed(graph.drive_s[end, here] / scale)
@@ -241,22 +210,21 @@ def observe(
         row[LOT_SIZE] = _squashed(0.01 * n)
         row[DAY_SHIFT] = shift / 4.0
         row[DAY_SPREAD] = spread
-        row[MEAN_P_FREE] = p_free_mean / n
+        row[MEAN_P_FREE] = p_free_sum / n
         row[BEST_KNOWN_FREE] = _squashed(least_option_s / scale)
         row[FAILURE_COST] = _squashed(now.failure_s / scale)
         row[GIVE_UP] = _squashed(graph.give_up_s / scale / 10.0)
         row[DECAY_RATE] = _squashed(nearest_rate * scale)
         row[N_ACTIONS] = n_actions / ACTION_COUNT
         row[N_OPTIONS] = options.size / MOST_OPTIONS
-    _write_tokens(now, candidates, ends, step_s, fallback_s, least_s, graph, belief, out)
+    _write_tokens(now, candidates, ends, step_s, least_s, outlook, out)
 
 
 @compiled(error_model="numpy")
 def _day_of_slots(candidates: IntArray, now: Situation, belief: BeliefSnapshot) -> tuple[float, float]:
-    """Return what the belief about the day says of the candidates that are unobserved.
+    """Return by how much the unobserved candidates are fuller than forecast, and how uncertain that is.
 
-    Returns:
-        By how much they are fuller than forecast, mean in logits; the standard deviation over days of their P(free).
+    The first is a mean in logits; the second the standard deviation of their P(free) over days.
     """
     p_if, n_unobserved, shift = np.zeros(len(belief.weights)), 0, 0.0
     for s in candidates:
@@ -277,25 +245,15 @@ def _write_tokens(
     candidates: IntArray,
     ends: IntArray,
     step_s: FloatArray,
-    fallback_s: float,
     least_s: float,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
+    outlook: Outlook,
     out: Features,
 ) -> None:
-    """Write the tokens: each candidate, seen through each action.
+    """Write the tokens: each candidate, -1 for none, seen through each action.
 
-    Args:
-        now: the situation.
-        candidates: (CANDIDATES,) slots, -1 for none.
-        ends: (6,) vertex after each action.
-        step_s: (6,) s, duration of each action.
-        fallback_s: s, remaining time of the search if a slot is taken on arrival.
-        least_s: s, least expected time of the look-ahead.
-        graph: the lot, or a part of it.
-        belief: the belief about its slots.
-        out: output.
+    `ends` and `step_s`, (6,), are the vertex after each action and its duration; `least_s` is that of the look-ahead.
     """
+    graph, belief = outlook.graph, outlook.belief
     scale = max(least_s, LEAST_SCALE)
     for i in range(CANDIDATES):
         s = candidates[i]
@@ -330,36 +288,32 @@ def _write_tokens(
             token[SLOT_SHIFT] = min(
                 max((_logit(1.0 - slot.p_free) - _logit(now.forecast[s])) / 4.0, -1.0), 1.0
             )
-            token[IS_FREE] = 1.0 if slot.state == OBSERVED_FREE else 0.0
-            token[IS_TAKEN] = 1.0 if slot.state == OBSERVED_TAKEN else 0.0
+            token[IS_FREE], token[IS_TAKEN] = slot.state == OBSERVED_FREE, slot.state == OBSERVED_TAKEN
             if now.observed_at[s] >= 0.0:
                 token[LAST_OBSERVED] = 1.0 - _squashed((now.time - now.observed_at[s]) / scale)
             token[COST] = _squashed(graph.cost_s[s] / scale)
             token[DRIVE] = _squashed(drive_s / scale)
             token[DRIVE_REGRET] = _regret(drive_s, nearest_s, scale)
             token[TOTAL_REGRET] = _regret(drive_s + graph.cost_s[s], least_s, scale)
-            token[IS_END] = 1.0 if s == ends[a] else 0.0
+            token[IS_END] = s == ends[a]
             token[DECAY] = _squashed(slot.decay_rate * min(drive_s, 1e6))
-            expected_s = expected_cost_to_slot(ends[a], s, slot.p_free, step_s[a], fallback_s, graph, belief)
+            expected_s = expected_cost_to_slot(
+                ends[a], s, slot.p_free, step_s[a], outlook.fallback_s, graph, belief
+            )
             token[EXPECTED_REGRET] = _regret(step_s[a] + expected_s, least_s, scale)
 
 
 @compiled(error_model="numpy")
-def _candidates(
-    here: int,
-    by_cost: IntArray,
-    failure_costs: FloatArray,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-) -> IntArray:
+def _candidates(here: int, failure_costs: FloatArray, outlook: Outlook) -> IntArray:
     """Return `CANDIDATES` different slots, -1 for none: the best to drive to at failure costs taken in turn."""
-    found, n_found = np.full(CANDIDATES, -1), 0
+    graph, belief = outlook.graph, outlook.belief
+    chosen, n_chosen = np.full(CANDIDATES, -1), 0
     n_costs = len(failure_costs)
     values = np.empty((n_costs, CANDIDATES))
     slots = np.full((n_costs, CANDIDATES), -1)
     for c in range(n_costs):
         values[c, :] = np.inf
-        for s in by_cost:
+        for s in outlook.by_cost:
             if graph.cost_s[s] >= values[c, CANDIDATES - 1]:
                 break
             value = graph.drive_s[here, s] + graph.cost_s[s]
@@ -379,10 +333,8 @@ def _candidates(
             values[c, place], slots[c, place] = value, s
     for i in range(CANDIDATES):
         for c in range(n_costs):
-            s, known = slots[c, i], n_found == CANDIDATES
-            for j in range(n_found):
-                known = known or found[j] == s
-            if s >= 0 and not known:
-                found[n_found] = s
-                n_found += 1
-    return found
+            s = slots[c, i]
+            if s >= 0 and n_chosen < CANDIDATES and not (chosen[:n_chosen] == s).any():
+                chosen[n_chosen] = s
+                n_chosen += 1
+    return chosen

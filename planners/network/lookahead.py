@@ -36,7 +36,6 @@ class Scratch(NamedTuple):
 
     @classmethod
     def of(cls, n_slots: int, n_hypotheses: int) -> Scratch:
-        """Allocate the buffers for a lot."""
         return cls(
             np.full(n_slots, -1.0),
             np.zeros(n_hypotheses),
@@ -49,27 +48,29 @@ class Scratch(NamedTuple):
         )
 
 
+class Outlook(NamedTuple):
+    """A decision, as the look-ahead reads it."""
+
+    by_cost: IntArray  # (n_slots,) the slots, least arrival cost first
+    options: IntArray  # (k,) slots known to be free now that are considered
+    fallback_s: float  # s, time of the search if such a slot is gone
+    graph: PlanningGraph
+    belief: BeliefSnapshot
+    scratch: Scratch
+
+
 @compiled(error_model="numpy")
-def next_target(
-    vertex: int,
-    seconds: float,
-    failure_s: float,
-    by_cost: IntArray,
-    seen_at: FloatArray,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-) -> tuple[int, float]:
+def next_target(vertex: int, seconds: float, failure_s: float, outlook: Outlook) -> tuple[int, float]:
     """Return the slot that the thesis's planner drives to, and its value, s; -1 and inf if there is none."""
+    graph, belief, seen_at = outlook.graph, outlook.belief, outlook.scratch.seen_at
     best, chosen = np.inf, -1
-    for s in by_cost:
+    for s in outlook.by_cost:
         cost_s = graph.cost_s[s]
         if cost_s >= best:
             break  # the others cost more, however near they are
         value = graph.drive_s[vertex, s] + cost_s
-        if value >= best:
-            continue
         at = belief.slots[s]
-        if at.state == OBSERVED_FREE:
+        if value >= best or at.state == OBSERVED_FREE:
             continue
         if at.state == UNOBSERVED and seen_at[s] < 0.0:
             value += failure_s * at.odds
@@ -84,110 +85,40 @@ def next_target(
 
 
 @compiled(error_model="numpy")
-def best_option(
-    vertex: int,
-    seconds: float,
-    options: IntArray,
-    fallback_s: float,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-) -> float:
+def best_option(vertex: int, seconds: float, outlook: Outlook) -> float:
     """Return the expected time, s, from a vertex to the best slot known to be free; inf if there is none."""
-    best = np.inf
-    for s in options:
+    graph, belief, best = outlook.graph, outlook.belief, np.inf
+    for s in outlook.options:
         if graph.drive_s[vertex, s] + graph.cost_s[s] < best:
-            value = expected_cost_to_slot(
-                vertex, s, belief.slots[s].p_free, seconds, fallback_s, graph, belief
-            )
+            p_free = belief.slots[s].p_free
+            value = expected_cost_to_slot(vertex, s, p_free, seconds, outlook.fallback_s, graph, belief)
             best = min(best, value)
     return best
 
 
 @compiled(error_model="numpy")
-def path_value(
-    vertex: int,
-    start_s: float,
-    failure_s: float,
-    by_cost: IntArray,
-    options: IntArray,
-    fallback_s: float,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-    scratch: Scratch,
-) -> tuple[float, float, int]:
-    """Evaluate the path of the thesis's planner from a vertex.
+def path_value(vertex: int, start_s: float, failure_s: float, outlook: Outlook) -> tuple[float, float, int]:
+    """Evaluate the path of the thesis's planner from a vertex, where the car is after `start_s` and observes, too.
 
-    Args:
-        vertex: where the path begins; slots are observed there, too.
-        start_s: s from now until the car is there.
-        failure_s: s, failure cost of the thesis's planner.
-        by_cost: (n_slots,) the slots, least arrival cost first.
-        options: (k,) slots known to be free now.
-        fallback_s: s, time of the search if such a slot is gone.
-        graph: the lot.
-        belief: the belief.
-        scratch: buffers.
-
-    Returns:
-        The expected time from now, s; P(nothing found on the path); its first target, or -1.
+    Return the expected time from now, s; P(nothing found on the path); its first target, or -1.
     """
-    weights = scratch.weights[: len(belief.weights)]
-    for h in range(len(weights)):
-        weights[h] = belief.weights[h]
-    n_observed, k, seconds, p_none = 0, 0, start_s, 1.0
-    found, found_cost = 0.0, 0.0
+    graph, scratch = outlook.graph, outlook.scratch
+    scratch.weights[: len(outlook.belief.weights)] = outlook.belief.weights
+    n_observed, k, seconds, sums = 0, 0, start_s, Sums(1.0, 0.0, 0.0)
     # `value` is what the thesis's planner expects from the current vertex: better slots are taken on the way.
-    target, value = next_target(vertex, seconds, failure_s, by_cost, scratch.seen_at, graph, belief)
+    target, value = next_target(vertex, seconds, failure_s, outlook)
     first_target = target
     scratch.first[0] = 0
     while True:
         scratch.time[k] = seconds
-        scratch.stop_s[k] = best_option(vertex, seconds, options, fallback_s, graph, belief)
-        retarget = target == vertex
-        for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
-            view = graph.views[i]
-            s = view.slot
-            at = belief.slots[s]
-            if (
-                at.state == OBSERVED_FREE
-                or n_observed == MOST_OBSERVATIONS
-                or is_hidden(s, view.rate, belief)
-            ):
-                continue
-            cost_s = graph.drive_s[vertex, s] + graph.cost_s[s]
-            if at.state == UNOBSERVED and scratch.seen_at[s] < 0.0:
-                p_free_if = belief.p_free_if[s]
-                p_free = 0.0
-                for h in range(len(weights)):
-                    p_free += weights[h] * p_free_if[h]
-                # Where the car would park, going on means that the slot was taken.
-                if cost_s <= value:
-                    rest = 1.0 / max(1.0 - p_free, 1e-9)
-                    for h in range(len(weights)):
-                        weights[h] *= (1.0 - p_free_if[h]) * rest
-            else:
-                p_free = p_free_again(s, seconds, scratch.seen_at[s], belief)
-                if p_free == 0.0:
-                    continue
-            scratch.slots[n_observed] = s
-            scratch.seen_at[s] = seconds
-            # Insert in the order of cost among the observations of this stop.
-            j = n_observed
-            while j > scratch.first[k] and scratch.cost_s[j - 1] > cost_s:
-                scratch.cost_s[j], scratch.p_free[j] = scratch.cost_s[j - 1], scratch.p_free[j - 1]
-                j -= 1
-            scratch.cost_s[j], scratch.p_free[j] = cost_s, p_free
-            n_observed += 1
-            if cost_s <= value:
-                p_none *= 1.0 - p_free
-            found += p_free
-            found_cost += p_free * cost_s
-            retarget = retarget or s == target
+        scratch.stop_s[k] = best_option(vertex, seconds, outlook)
+        n_before = n_observed
+        n_observed, sums = _observe_here(vertex, seconds, value, n_before, sums, outlook)
         scratch.first[k + 1] = n_observed
-        if p_none < ENOUGH or k == MOST_STOPS - 1 or n_observed == MOST_OBSERVATIONS:
+        if sums.p_none < ENOUGH or k == MOST_STOPS - 1 or n_observed == MOST_OBSERVATIONS:
             break
-        if retarget:
-            target, value = next_target(vertex, seconds, failure_s, by_cost, scratch.seen_at, graph, belief)
+        if target == vertex or (scratch.slots[n_before:n_observed] == target).any():
+            target, value = next_target(vertex, seconds, failure_s, outlook)
         if target < 0:
             break
         if target == vertex:
@@ -201,11 +132,72 @@ def path_value(
             value -= step_s
             vertex = following
         k += 1
-    last = k
     # After the end, slots are found at the same rate as before.
     rest_s = graph.give_up_s
-    if found > 1e-6:
-        rest_s = min(rest_s, (max(seconds - start_s, graph.wait_s) + found_cost) / found)
+    if sums.p_free > 1e-6:
+        rest_s = min(rest_s, (max(seconds - start_s, graph.wait_s) + sums.cost_s) / sums.p_free)
+    for j in range(n_observed):
+        scratch.seen_at[scratch.slots[j]] = -1.0
+    return start_s + _stop_optimally(k, rest_s, scratch), sums.p_none, first_target
+
+
+class Sums(NamedTuple):
+    """Sums over the observations of a path."""
+
+    p_none: float  # P(no slot that is worth parking in is free)
+    p_free: float
+    cost_s: float  # weighted by P(free)
+
+
+@compiled(error_model="numpy")
+def _observe_here(
+    vertex: int, seconds: float, value: float, n_observed: int, sums: Sums, outlook: Outlook
+) -> tuple[int, Sums]:
+    """Add the observations from a vertex, the cheapest first; return the number of all, and their sums."""
+    graph, belief, scratch = outlook.graph, outlook.belief, outlook.scratch
+    weights, before = scratch.weights[: len(belief.weights)], n_observed
+    p_none, p_sum, cost_sum = sums
+    for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
+        s = graph.views[i].slot
+        at = belief.slots[s]
+        if (
+            at.state == OBSERVED_FREE
+            or n_observed == MOST_OBSERVATIONS
+            or is_hidden(s, graph.views[i].rate, belief)
+        ):
+            continue
+        cost_s = graph.drive_s[vertex, s] + graph.cost_s[s]
+        if at.state == UNOBSERVED and scratch.seen_at[s] < 0.0:
+            p_free_if = belief.p_free_if[s]
+            p_free = 0.0
+            for h in range(len(weights)):
+                p_free += weights[h] * p_free_if[h]
+            # Where the car would park, going on means that the slot was taken.
+            if cost_s <= value:
+                rest = 1.0 / max(1.0 - p_free, 1e-9)
+                for h in range(len(weights)):
+                    weights[h] *= (1.0 - p_free_if[h]) * rest
+        else:
+            p_free = p_free_again(s, seconds, scratch.seen_at[s], belief)
+            if p_free == 0.0:
+                continue
+        scratch.slots[n_observed], scratch.seen_at[s] = s, seconds
+        j = n_observed
+        while j > before and scratch.cost_s[j - 1] > cost_s:
+            scratch.cost_s[j], scratch.p_free[j] = scratch.cost_s[j - 1], scratch.p_free[j - 1]
+            j -= 1
+        scratch.cost_s[j], scratch.p_free[j] = cost_s, p_free
+        n_observed += 1
+        if cost_s <= value:
+            p_none *= 1.0 - p_free
+        p_sum += p_free
+        cost_sum += p_free * cost_s
+    return n_observed, Sums(p_none, p_sum, cost_sum)
+
+
+@compiled(error_model="numpy")
+def _stop_optimally(last: int, rest_s: float, scratch: Scratch) -> float:
+    """Return the expected time, s, of a car that stops at the first slot that is better than going on."""
     ahead = min(rest_s, scratch.stop_s[last])
     for k in range(last, -1, -1):
         if k < last:
@@ -217,6 +209,4 @@ def path_value(
             expected += p_rest * scratch.p_free[j] * scratch.cost_s[j]
             p_rest *= 1.0 - scratch.p_free[j]
         ahead = expected + p_rest * ahead
-    for j in range(n_observed):
-        scratch.seen_at[scratch.slots[j]] = -1.0
-    return start_s + ahead, p_none, first_target
+    return float(ahead)

@@ -112,18 +112,15 @@ class StaticAgent(SearchAgent[Plan]):
         return self._mdp.expected_time(-self.solve(p_occupied).cost)
 
     def begin(self, observation: Observation, belief: SlotBelief) -> Plan:
-        """Plan with the forecast."""
         del observation
         return Plan(self._graph, self.solve(belief.p_occupied))
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: Plan) -> int:
-        """Follow the plan."""
         del belief
         labels = memory.labels
         return int(best_move(self._graph, labels.p_free, labels.cost, int(observation["vertex"])))
 
     def plan_preview(self, observation: Observation, action: int, memory: Plan) -> PlanPreview:
-        """Return the path of the plan to a slot."""
         labels, vertex = memory.labels, int(observation["vertex"])
         path: list[int] = []
         while len(path) < MOST_HOPS and action != PARK:
@@ -178,7 +175,6 @@ class ReplanningAgent(StaticAgent):
         self._nearness = nearness(self.problem.walk_s) if day else None
 
     def begin(self, observation: Observation, belief: SlotBelief) -> Plan:
-        """Plan with the belief at the start."""
         plan = super().begin(observation, belief)
         if self._nearness is not None:
             plan.day = DayBelief(belief, self._nearness)

@@ -272,7 +272,6 @@ class TunedAgent(SearchAgent[TunedPlan]):
         return self._tuned[key]
 
     def begin(self, observation: Observation, belief: SlotBelief) -> TunedPlan:
-        """Choose the failure cost, and plan with it."""
         vertex = int(observation["vertex"])
         best = self.tuning(belief.p_occupied, vertex, DayError(*map(float, belief.day_error))).best
         if best not in self._planners:
@@ -291,7 +290,6 @@ class TunedAgent(SearchAgent[TunedPlan]):
         return self._planners[memory.failure_s].decide(observation, belief, memory.plan)
 
     def plan_preview(self, observation: Observation, action: int, memory: TunedPlan) -> PlanPreview:
-        """Return the route to the entry, or the plan at the chosen cost."""
         if memory.entry >= 0:
             return PlanPreview(self._routes.path(int(observation["vertex"]), memory.entry))
         return self._planners[memory.failure_s].plan_preview(observation, action, memory.plan)
