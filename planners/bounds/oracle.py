@@ -111,6 +111,7 @@ class OracleAgent(SearchAgent[OracleState]):
         self._time = 0.0
 
     def prepare(self, world: World, time: float) -> None:
+        """Receive the world of the next episode and its start time, s since Monday 00:00."""
         self._world, self._time = world, time
 
     def begin(self, observation: Observation, belief: SlotBelief) -> OracleState:

@@ -242,7 +242,7 @@ def _search(
         x, y, yaw = pose[node]
         if tight or opened <= 64 or opened % 4 == 0:
             below = best - cost[node]
-            word, more = cheapest_shot(space, x, y, yaw, end, costs, way[node], steering[node], below, words)
+            word, more = cheapest_shot(space, pose[node], end, costs, way[node], steering[node], below, words)
             if word >= 0:
                 if shot_node < 0:
                     last = min(last, opened + int(limits.patience * opened) + 32)

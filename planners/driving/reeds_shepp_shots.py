@@ -85,9 +85,7 @@ def _word_is_free(
 @compiled(error_model="numpy")
 def cheapest_shot(
     space: Clearance,
-    x: float,
-    y: float,
-    yaw: float,
+    start: FloatArray,
     end: FloatArray,
     costs: DriveCosts,
     direction: float,
@@ -99,6 +97,7 @@ def cheapest_shot(
 
     The car arrives with a direction, 1 or -1 (0 at a standstill), and a curvature of `steering` times the maximum.
     """
+    x, y, yaw = start[0], start[1], start[2]
     dx, dy = end[0] - x, end[1] - y
     c, s = math.cos(yaw), math.sin(yaw)
     along, across = (c * dx + s * dy) / costs.radius, (c * dy - s * dx) / costs.radius
@@ -146,12 +145,11 @@ def shorten_path(
             whole = _path_cost(lengths, curvatures, costs)
             for end in range(n, first + 1, -1):
                 part = _path_cost(lengths[first:end], curvatures[first:end], costs)
-                x, y, yaw = poses[first]
                 direction = lengths[first - 1] if first > 0 else 0.0
                 steering = curvatures[first - 1] * radius if first > 0 else 0.0
                 below = part + 2.0 * costs.change_m
                 word, _ = cheapest_shot(
-                    space, x, y, yaw, poses[end], costs, direction, steering, below, words
+                    space, poses[first], poses[end], costs, direction, steering, below, words
                 )
                 if word < 0:
                     continue

@@ -20,7 +20,7 @@ from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from planners.belief.path import expected_cost_to_slot, options_at_hand
-from planners.belief.planning_graph import BeliefSnapshot, is_hidden, needs_attempt
+from planners.belief.planning_graph import BeliefSnapshot, PlanningGraph, is_hidden, needs_attempt
 from planners.network.lookahead import Outlook, best_option, next_target, path_value
 
 ACTION_COUNT = 6
@@ -123,10 +123,7 @@ def observe(now: Situation, failure_costs: FloatArray, outlook: Outlook, out: Fe
     graph, belief = outlook.graph, outlook.belief
     here, n, n_costs = now.here, len(belief.slots), len(failure_costs)
     ends, step_s = np.full(ACTION_COUNT, -1), np.full(ACTION_COUNT, np.inf)
-    for a in range(PARKING):
-        ends[a] = now.following[a]
-        if now.following[a] >= 0:
-            step_s[a] = now.move_s[a]
+    ends[:PARKING], step_s[:PARKING] = now.following, np.where(now.following >= 0, now.move_s, np.inf)
     # A slot that is seen taken from its own vertex is not worth an attempt.
     if here < n and (belief.slots[here].state == OBSERVED_FREE or needs_attempt(here, graph, belief)):
         ends[PARKING], step_s[PARKING] = here, 0.0
@@ -182,19 +179,7 @@ def observe(now: Situation, failure_costs: FloatArray, outlook: Outlook, out: Fe
         row[KNOWN_FREE] = _squashed(option_s[a] / scale)
         if least_option_s < np.inf:
             row[KNOWN_FREE_REGRET] = _regret(option_s[a], least_option_s, scale)
-        if end < n:
-            row[END_P_FREE] = belief.slots[end].p_free
-            row[END_UNOBSERVED] = belief.slots[end].state == UNOBSERVED
-            row[END_COST] = _squashed(graph.cost_s[end] / scale)
-        if a != PARKING:
-            new, n_new = 0.0, 0
-            for i in range(graph.view_starts[end], graph.view_starts[end + 1]):
-                s, rate = graph.views[i].slot, graph.views[i].rate
-                if belief.slots[s].state == UNOBSERVED and not is_hidden(s, rate, belief):
-                    new += belief.slots[s].p_free
-                    n_new += 1
-            row[VIEW_P_FREE], row[VIEW_SLOTS] = _squashed(new), _squashed(0.25 * n_new)
-            row[DRIVE_BACK] = _squashed(graph.drive_s[end, here] / scale)
+        _write_end(row, end, a != PARKING, here, scale, graph, belief)
         for c in range(n_costs):
             at = PATHS + PATH_FEATURES * c
             row[at + PATH_TIME] = _squashed(path_s[a, c] / scale)
@@ -218,6 +203,32 @@ def observe(now: Situation, failure_costs: FloatArray, outlook: Outlook, out: Fe
         row[N_ACTIONS] = n_actions / ACTION_COUNT
         row[N_OPTIONS] = options.size / MOST_OPTIONS
     _write_tokens(now, candidates, ends, step_s, least_s, outlook, out)
+
+
+@compiled(error_model="numpy")
+def _write_end(
+    row: NDArray[np.float32],
+    end: int,
+    moves: bool,
+    here: int,
+    scale: float,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+) -> None:
+    """Write what an action leads to: the slot at its end, and what is unobserved in view from there."""
+    if end < len(belief.slots):
+        row[END_P_FREE] = belief.slots[end].p_free
+        row[END_UNOBSERVED] = belief.slots[end].state == UNOBSERVED
+        row[END_COST] = _squashed(graph.cost_s[end] / scale)
+    if moves:
+        new, n_new = 0.0, 0
+        for i in range(graph.view_starts[end], graph.view_starts[end + 1]):
+            s, rate = graph.views[i].slot, graph.views[i].rate
+            if belief.slots[s].state == UNOBSERVED and not is_hidden(s, rate, belief):
+                new += belief.slots[s].p_free
+                n_new += 1
+        row[VIEW_P_FREE], row[VIEW_SLOTS] = _squashed(new), _squashed(0.25 * n_new)
+        row[DRIVE_BACK] = _squashed(graph.drive_s[end, here] / scale)
 
 
 @compiled(error_model="numpy")
