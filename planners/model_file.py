@@ -223,7 +223,7 @@ def save_model(
         for key, value in (model.policy_kwargs or {}).items()
         if not key.startswith("optimizer_")
     }
-    found = {key: None if value != value else float(value) for key, value in (results or {}).items()}
+    numbers = {key: None if value != value else float(value) for key, value in (results or {}).items()}
     card = ModelCard.parse(
         {
             "algorithm": algorithm, "observation": OBSERVATION, "k": k,
@@ -232,7 +232,7 @@ def save_model(
             "action_space": int(model.action_space.n),
             "scenarios": tuple(scenarios), "held_out": tuple(held_out), "seed": model.seed,
             "steps": model.num_timesteps, "settings": to_jsonable_python(dict(settings or {})),
-            "results": found, "command": tuple(command),
+            "results": numbers, "command": tuple(command),
         },
         "model",
     )  # fmt: skip
@@ -251,12 +251,7 @@ def slots_observed(space: spaces.Space[Any]) -> int:
 
 
 def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard, Any]:
-    """Load a model's card and policy; no code from the file is run.
-
-    Args:
-        algorithm: algorithm that it was trained with.
-        path: the model file.
-    """
+    """Load the card and policy of a model trained with an algorithm; no code from the file is run."""
     data = read_bytes(Path(path), _MAX_BYTES)
     card = ModelCard._of_bytes(data, path)
     if card.algorithm != algorithm:
@@ -296,20 +291,13 @@ def _no_rate(progress: float) -> float:
 
 
 def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:
-    """Convert an archive of stable-baselines3's `model.save` to a model file beside it.
+    """Convert an archive, `NAME.zip`, of stable-baselines3's `model.save` to a model file beside it; return that.
 
     This unpickles the archive, which runs whatever code its author put there.
-
-    Args:
-        algorithm: algorithm that it was trained with.
-        path: the archive, `NAME.zip`.
-
-    Returns:
-        The model file, `NAME.safetensors`.
     """
-    made = Path(path).with_suffix(SUFFIX)
-    if made.exists():
-        raise InputError(f"{made}: exists; name it instead of {path}, or remove it")
+    converted = Path(path).with_suffix(SUFFIX)
+    if converted.exists():
+        raise InputError(f"{converted}: exists; name it instead of {path}, or remove it")
     # A model that is not trained further needs no replay buffer, and no schedules, which may be another package's.
     unneeded: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
     unneeded |= {"learning_rate": 0.0} | dict.fromkeys(("lr_schedule", "clip_range"), _no_rate)
@@ -318,23 +306,12 @@ def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:
         model = kind.load(Path(path), device="cpu", custom_objects=unneeded)
     except Exception as error:  # unpickling raises anything
         raise InputError(f"{path}: no archive of {algorithm} ({type(error).__name__}: {error})") from error
-    save_model(model, made)
-    return made
+    save_model(model, converted)
+    return converted
 
 
 class LearnedAgent:
-    """A trained model as an agent, on `parkenv.engine.local_observation`.
-
-    Args:
-        problem: lot, goal, speeds and costs.
-        algorithm: algorithm that it was trained with.
-        path: the model file.
-
-    Attributes:
-        card: metadata of the file.
-        model: the policy.
-        local_k: number of slots in the observation.
-    """
+    """A trained model as an agent, on `parkenv.engine.local_observation` of `local_k` slots."""
 
     def __init__(self, problem: SearchProblem, algorithm: str, path: str | os.PathLike[str]) -> None:
         self.name = f"{algorithm}:{path}"

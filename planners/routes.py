@@ -25,11 +25,7 @@ _NONE = -1
 
 
 class DriveRoutes:
-    """Drive times from a vertex, and shortest routes.
-
-    Args:
-        problem: the lot and the driving speed.
-    """
+    """Drive times from a vertex, and shortest routes."""
 
     def __init__(self, problem: SearchProblem) -> None:
         # Copies: numba would compile every function again for read-only arrays.
@@ -46,14 +42,9 @@ class DriveRoutes:
         return self._outward(vertex, nowhere)[0]
 
     def nearest(self, vertex: int, slots: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float]:
-        """Return the slots of a set with the shortest drive.
+        """Return the nearest of `slots`, (n_slots,) bool, from a vertex, and their drive time, s.
 
-        Args:
-            vertex: where the car is.
-            slots: (n_slots,) bool, to choose from.
-
-        Returns:
-            (k,) int64, ascending, the nearest slots, and their drive time, s; none and inf if none is reachable.
+        They are (k,) int64, ascending; none and inf if none is reachable.
         """
         seconds, reached = self._outward(vertex, slots)
         if reached == _NONE:
@@ -119,17 +110,9 @@ def _search(
 ) -> int:
     """Run Dijkstra's algorithm until the first of `ends`, (k,) bool of the first k vertices, is settled.
 
-    Args:
-        start: (n + 1,) int32, the edges of v are rows `start[v]` to `start[v + 1]` of the next two.
-        leads_to: (m,) int32, the vertex at an edge's other end; -1 for no edge.
-        edge_s: (m,) s, drive time of each edge.
-        origin: the start vertex.
-        ends: vertices at which the search may stop.
-        seconds: (n,) s, all inf; output: drive times, exact up to the vertex where the search stopped, upper bounds
-            beyond.
-
-    Returns:
-        One of the nearest of `ends`, or -1.
+    The edges of v are rows `start[v]` to `start[v + 1]` of `leads_to`, the vertex at the other end or -1, and `edge_s`.
+    `seconds`, (n,), all inf at first, become drive times, exact up to the vertex where the search stopped, upper bounds
+    beyond. Return one of the nearest of `ends`, or -1.
     """
     keys, vertices = np.empty(len(leads_to) + 1), np.empty(len(leads_to) + 1, dtype=np.int32)
     seconds[origin] = 0.0
@@ -152,9 +135,7 @@ def _search(
 class RoadTable:
     """Shortest drives between all vertices, computed when they are first asked for, or before, a few rows at a time.
 
-    Args:
-        neighbors: (n_vertices, 4) int32, target of each move, or -1.
-        move_s: (n_vertices, 4) float64, s, duration of each move.
+    `neighbors`, (n_vertices, 4) int32, is the target of each move, or -1; `move_s` its duration, s.
     """
 
     def __init__(self, neighbors: NDArray[np.int32], move_s: FloatArray) -> None:

@@ -182,11 +182,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         self._routes = DriveRoutes(self.problem)
 
     def compile_ahead(self, belief: SlotBelief) -> None:
-        """Compile the search of a path, which takes as long as all else that a search needs, without an environment.
-
-        Args:
-            belief: any belief about the lot.
-        """
+        """Compile the search of a path for any belief, which takes as long as all else that a search needs."""
         near = self._neighborhoods.toward(int(self.problem.lot.entry_vertices[0]))
         memory = self._search_of(near, belief, Crowd(0.0))
         self._follow_best_path(int(near.vertices[0]), 0, belief.take(near.slots), memory)
@@ -250,7 +246,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.entry, memory.news_at = -1, memory.time
         here = memory.near.index(vertex)
         # Search another part if half of the unobserved slots have been observed, or none for a long time.
-        half = 2 * _n_unobserved(memory.state) < memory.n_unobserved
+        half = 2 * np.count_nonzero(memory.state == UNOBSERVED) < memory.n_unobserved
         spent = not memory.near.whole and (half or memory.time - memory.news_at > STALE_S)
         action = None if here < 0 or spent else self._follow_best_path(vertex, here, known, memory)
         if action is None and not memory.near.whole:
@@ -330,7 +326,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         vars(memory).update(vars(new))
         memory.entry = -1 if near.entry == vertex else near.entry
         known = self._update(belief, vertex, memory)
-        memory.n_unobserved = _n_unobserved(memory.state)
+        memory.n_unobserved = np.count_nonzero(memory.state == UNOBSERVED)
         return known
 
     def plan_preview(self, observation: Observation, action: int, memory: BeliefSearch) -> PlanPreview:
@@ -361,7 +357,3 @@ def snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapsh
     drive_s = memory.near.table.seconds[here]
     set_slots(belief, known.parts, memory.day.p_occupied(known.time), drive_s)
     return belief
-
-
-def _n_unobserved(state: NDArray[np.int8]) -> int:
-    return int((state == UNOBSERVED).sum())

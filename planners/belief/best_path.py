@@ -73,16 +73,10 @@ def best_path(
 ) -> PathChoice:
     """Search for the path with the least expected time, starting from the path of the last decision.
 
-    Args:
-        vertex: where the car is.
-        course: that of the last decision; without `heading` where its slot was observed since.
-        remaining_s: s, time expected to remain on that path, or inf if something was observed since. The path is kept
-            unless another is better than this: estimates depend on the position of the car, so it could turn round for
-            ever.
-        budget: limits of the search.
-        graph: the lot.
-        belief: the belief.
-        paths: buffers, one more than there are failure costs.
+    `course` is that of the last decision, without `heading` where its slot was observed since. `remaining_s` is the
+    time expected to remain on that path, or inf if something was observed since: the path is kept unless another is better
+    than this. Estimates depend on the position of the car, so it could turn round for ever. `paths` are buffers, one
+    more than there are failure costs.
     """
     # Nearest vertices first: with a small budget they matter most for the next step.
     order = np.argsort(graph.drive_s[vertex], kind="stable")

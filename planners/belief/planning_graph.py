@@ -149,11 +149,7 @@ class BeliefSnapshot(NamedTuple):
 def set_slots(belief: BeliefSnapshot, parts: FloatArray, p_occupied: FloatArray, drive_s: FloatArray) -> None:
     """Fill in the records of the slots, except what was observed of them.
 
-    Args:
-        belief: the belief; output: its slots.
-        parts: (4 * n_slots,) float64, see `SlotBelief`.
-        p_occupied: (n_slots,) P(taken) now.
-        drive_s: (n_vertices,) s, drive time from the car.
+    `parts` is that of `SlotBelief`, `p_occupied`, (n_slots,), P(taken) now, `drive_s`, (n_vertices,), from the car.
     """
     n = len(belief.slots)
     for s in range(n):
@@ -251,14 +247,10 @@ def decayed_part(rate: float, seconds: float) -> float:
 
 @leaf
 def detects_missed(rate: float, missed_rate: float) -> bool:
-    """Return whether a view is more likely than not to detect a slot that another view has missed.
+    """Return whether a view is more likely than not to detect a slot that others have missed.
 
     Whatever hides a slot keeps hiding it: a view detects every slot that a view with a lower rate detects
-    (`SensorBand`).
-
-    Args:
-        rate: P(the view detects the slot).
-        missed_rate: the highest such rate among the views that missed it; 0 if there were none.
+    (`SensorBand`). `missed_rate` is the highest rate, P(the view detects the slot), among those that missed it, or 0.
     """
     return rate > missed_rate and rate - missed_rate >= 0.5 * (1.0 - missed_rate)
 

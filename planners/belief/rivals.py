@@ -141,12 +141,8 @@ def _take_rates(
     The rates are those of the equilibrium in which a slot becomes free at the forecast rate: then rivals find parking
     at the rate at which they arrive, unless the lot is full.
 
-    Args:
-        p_free: (n_slots,) forecast.
-        leaving: (n_slots,) 1/s, rate at which a taken slot becomes free; where it is 0, nothing changes.
-        order: (n_slots,) slots, best first.
-        per_s: rivals per second.
-        passed: mean number of free slots that a rival passes.
+    `leaving`, (n_slots,) 1/s, is the rate at which a taken slot becomes free; where it is 0, nothing changes. `order`
+    has the best slots first; rivals come at `per_s` and pass `passed` free slots in the mean.
     """
     rates, n_better = np.zeros(len(p_free)), 0.0
     for s in order:

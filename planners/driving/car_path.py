@@ -66,11 +66,9 @@ def count_changes(values: FloatArray) -> int:
 
 
 def rounded(points: FloatArray, radius: float) -> CarPath:
-    """Make a path along a polyline with rounded corners.
+    """Make a path along a polyline with rounded corners; points are (k, 2) m, in the order driven.
 
-    Args:
-        points: (k, 2) m, two or more, in the order driven.
-        radius: radius of the arcs, m; smaller where legs are short: an arc uses at most half of each adjacent leg.
+    Arcs are smaller where legs are short: they use at most half of each adjacent leg.
     """
     step = np.diff(points, axis=0)
     leg = np.hypot(step[:, 0], step[:, 1])

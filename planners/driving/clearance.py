@@ -39,14 +39,9 @@ class Clearance(NamedTuple):
 def clearance(
     vehicle: VehicleParameters, outlines: FloatArray, n_corners: IntArray, low: FloatArray, high: FloatArray
 ) -> Clearance:
-    """Prepare collision checks.
+    """Prepare collision checks of a car among convex outlines, (n, k_max, 2) m, the first `n_corners`, (n,), of each.
 
-    Args:
-        vehicle: the car.
-        outlines: (n, k_max, 2) m, convex.
-        n_corners: (n,) number of valid corners of each outline, at least 2.
-        low: (2,) m, lower corner of the window; poses outside count as collisions.
-        high: (2,) m, its upper corner.
+    `low` and `high`, (2,) m, are the corners of the window; poses outside count as collisions.
     """
     used = np.arange(outlines.shape[1]) < n_corners[:, None]
     center = (outlines * used[..., None]).sum(axis=1) / n_corners[:, None]

@@ -53,21 +53,14 @@ _BRAKING = 2.0  # m/s², for road users
 
 @dataclass(frozen=True, eq=False)
 class Manoeuvre:
-    """A planned and driven manoeuvre.
-
-    Attributes:
-        scene: the scene.
-        path: the path that was driven; None if none was found.
-        states: (n, 6) states of the vehicle every `PHYSICS_S` from the start on; see `parkenv.driving.vehicle`.
-        planning_s: wall time of planning, s.
-        others: (n, m, 3) poses of the scene's road users at the same times.
-    """
+    """A planned and driven manoeuvre."""
 
     scene: Scene
-    path: CarPath | None
+    path: CarPath | None  # the path that was driven; None if none was found
+    # (n, 6) states of the vehicle every `PHYSICS_S` from the start on; see `parkenv.driving.vehicle`
     states: FloatArray
-    planning_s: float
-    others: FloatArray | None = None
+    planning_s: float  # wall time of planning
+    others: FloatArray | None = None  # (n, m, 3) poses of the scene's road users at the same times
 
     @property
     def time_s(self) -> float:
@@ -122,10 +115,7 @@ def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None)
 
     The car is driven fluently; where that would touch something or end too far from the target, it is driven anew
     and stops to turn its wheels, or on another path. The planner knows the vehicle's model, so it finds that out first.
-
-    Args:
-        scene: the scene.
-        plan: yields paths; `paths_in_scene` if None.
+    `plan` yields paths; `paths_in_scene` if None.
     """
     paths, planning_s, tried = (plan or paths_in_scene)(scene), 0.0, list[Manoeuvre]()
     while not any(manoeuvre.judged.driven for manoeuvre in tried):
@@ -205,8 +195,7 @@ def aim(scene: Scene) -> FloatArray:
 def drive(scene: Scene, path: CarPath, tracking: TrackingSettings) -> tuple[FloatArray, FloatArray | None]:
     """Track a path from a standstill to a stop at its end, and wait for road users in the way.
 
-    Returns:
-        The states, (n, 6), every `PHYSICS_S`, and the poses of the scene's road users, (n, m, 3); None without any.
+    Return the states, (n, 6), every `PHYSICS_S`, and the poses of the scene's road users, (n, m, 3); None without any.
     """
     vehicle = scene.vehicle
     tracker = PathTracker(vehicle, path, tracking)

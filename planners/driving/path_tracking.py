@@ -184,14 +184,7 @@ class PathTracker:
 
 
 class LaneKeeper(PathTracker):
-    """Follow a path on a lane, starting at the current speed.
-
-    Args:
-        vehicle: the car.
-        path: the path.
-        settings: settings of the tracking.
-        aside: maximum lateral acceleration, m/s²; the car slows down in turns accordingly.
-    """
+    """Follow a path on a lane, starting at the current speed, with at most `aside` m/s² to the side in turns."""
 
     def __init__(
         self,

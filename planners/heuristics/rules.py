@@ -60,32 +60,32 @@ _ROUNDING_S = 1e-6
 rule = compiled(error_model="numpy", _nrt=False)
 inlined_rule = compiled(error_model="numpy", _nrt=False, forceinline=True)
 
+
+def addresses(names: str) -> list[tuple[str, Any]]:
+    """Return fields of a record, separated by spaces, that hold addresses of arrays."""
+    return [(name, ADDRESS) for name in names.split()]
+
+
 TABLES = np.dtype(
     [
         ("heuristic", np.int64),
         ("n_slots", np.int64),
         ("n_vertices", np.int64),
         # The drive graph, (n_vertices, 4): int32 vertex that each move leads to, -1 for none; float64 its cost, s.
-        ("neighbors", ADDRESS),
-        ("move_s", ADDRESS),
+        *addresses("neighbors move_s"),
         # By place: (n_slots,) float64 arrival costs, s; float64, arrival cost up to which `FIRST_FREE` takes a free
         # slot at once, s.
-        ("arrival_cost_s", ADDRESS),
-        ("near_s", ADDRESS),
+        *addresses("arrival_cost_s near_s"),
         # A slot with the lowest parking cost.
         ("least_price", np.int64),
         # What the observation of an agent holds, (n_slots,): uint8 recent states; float64 P(taken).
-        ("states", ADDRESS),
-        ("p_occupied", ADDRESS),
+        *addresses("states p_occupied"),
         # Of the last search in the graph: (n_vertices,) float64 drive times, s, inf where it did not arrive;
         # (n_vertices,) int32, the last edge of the shortest route to each vertex, 4 v + move from vertex v;
         # (n_vertices + 1,) int32, how many vertices it reached, and then these.
-        ("seconds", ADDRESS),
-        ("last_edge", ADDRESS),
-        ("reached", ADDRESS),
+        *addresses("seconds last_edge reached"),
         # A heap: (4 n_vertices + 1,) float64 keys, int32 vertices.
-        ("keys", ADDRESS),
-        ("vertices", ADDRESS),
+        *addresses("keys vertices"),
     ],
     align=True,
 )

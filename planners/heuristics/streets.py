@@ -52,6 +52,7 @@ from parkenv.world.lot import MOVES, ParkingLot
 from parkenv.world.scenario import SearchProblem
 from planners.heuristics.rules import (
     GREEDY_DRIVE,
+    addresses,
     choose_route,
     cost_of,
     heuristic_tables,
@@ -69,62 +70,35 @@ STREETS = np.dtype(
     [
         # TABLES of `greedy-drive`, for where no place is left.
         ("plain", ADDRESS),
-        ("n_slots", np.int64),
-        ("n_zones", np.int64),
-        ("n_junctions", np.int64),
-        ("n_streets", np.int64),
-        ("n_places", np.int64),
+        *((name, np.int64) for name in ("n_slots", "n_zones", "n_junctions", "n_streets", "n_places")),
         # The drive graph, (n_vertices, 4): int32 vertex that each move leads to; float64 its cost, s.
-        ("neighbors", ADDRESS),
-        ("move_s", ADDRESS),
+        *addresses("neighbors move_s"),
         # (n_junctions, 4) int32 street that each move of a junction enters, or -1.
-        ("street_of", ADDRESS),
+        *addresses("street_of"),
         # By street, one direction each: int32 junctions at its ends, as vertices; float64 its length, s; uint8 the move
         # that leaves it; (n_streets + 1,) int32 its first position among the slots, and its first place.
-        ("start", ADDRESS),
-        ("end", ADDRESS),
-        ("length_s", ADDRESS),
-        ("last_move", ADDRESS),
-        ("first", ADDRESS),
-        ("first_place", ADDRESS),
+        *addresses("start end length_s last_move first first_place"),
         # By position, street by street in the order of the drive: int32 slot; int32 street; float64 drive from the
         # beginning of the street, s; uint8 move that leads there. By slot: int32 its position.
-        ("slots", ADDRESS),
-        ("street_at", ADDRESS),
-        ("along_s", ADDRESS),
-        ("move_into", ADDRESS),
-        ("position", ADDRESS),
+        *addresses("slots street_at along_s move_into position"),
         # (n_places + 1,) int32 first position of each place; (n_places,) int64 its zone; (n_goals,
         # n_places) float64 lower bound on the arrival cost of its slots, s, without and with the price of the stay.
-        ("place_first", ADDRESS),
-        ("place_zone", ADDRESS),
-        ("place_walk_s", ADDRESS),
-        ("place_cost_s", ADDRESS),
+        *addresses("place_first place_zone place_walk_s place_cost_s"),
         # (n_slots,) int64 zone of each slot.
-        ("zone_of_slot", ADDRESS),
+        *addresses("zone_of_slot"),
         # By goal: (n_slots,) float64 arrival costs, s; (n_junctions,) float64, the least drive and bound from there, s.
-        ("arrival_cost_s", ADDRESS),
-        ("onward_walk_s", ADDRESS),
-        ("onward_cost_s", ADDRESS),
+        *addresses("arrival_cost_s onward_walk_s onward_cost_s"),
         # What the observation of an agent holds, (n_slots,): uint8 recent states, and those last observed; float64
         # P(taken), and its forecast.
-        ("states", ADDRESS),
-        ("last_states", ADDRESS),
-        ("p_occupied", ADDRESS),
-        ("forecast", ADDRESS),
+        *addresses("states last_states p_occupied forecast"),
         # Of the last search: (n_zones,) float64 slots seen free, and expected free.
-        ("seen_free", ADDRESS),
-        ("expected_free", ADDRESS),
+        *addresses("seen_free expected_free"),
         # Of the last search: by junction, float64 drive, s, inf where it did not arrive; int32 the street by which it
         # is reached, and the position on it from which that was entered, -1 for its beginning; (n_junctions + 1,)
         # int32, how many junctions it reached, and then these.
-        ("seconds", ADDRESS),
-        ("via", ADDRESS),
-        ("via_from", ADDRESS),
-        ("reached", ADDRESS),
+        *addresses("seconds via via_from reached"),
         # A heap: (n_streets + 8,) float64 keys, int32 junctions.
-        ("keys", ADDRESS),
-        ("vertices", ADDRESS),
+        *addresses("keys vertices"),
         # Best place so far: its index, s; int32 position of the target, its street, position from which that is
         # entered.
         ("best_s", np.float64),
@@ -244,18 +218,8 @@ def choose_place(
 ) -> tuple[int, int, float]:
     """Choose the slot to drive to, the last one in its place that may be free, and plan the way through the place.
 
-    Args:
-        address: address of the STREETS record.
-        goal: index of the problem.
-        search: address of the SEARCH record whose tables hold what was observed; 0: the record's own arrays do.
-        vertex: where the car is.
-        target: the target so far, or `NO_SLOT`.
-        moves: (2 n_vertices,) the moves to the target, the last one first; changed in place.
-        n_moves: how many there are.
-
-    Returns:
-        The target, or `NO_SLOT`; the number of moves to it; the index of its place, s. If no place may have a free
-        slot, they are those of `greedy-drive`, and an infinite index.
+    Arguments are as for `choose_route`, but of the STREETS record. Return the target, or `NO_SLOT`; the number of moves
+    to it; the index of its place, s. If no place may have a free slot, they are those of `greedy-drive`, and inf.
     """
     streets = streets_at(address, 0)
     _search_places(streets, goal, search, vertex)

@@ -88,11 +88,7 @@ class StaticAgent(SearchAgent[Plan]):
         self._suspect_s = least_s / (1.0 - gamma) if gamma < 1.0 else np.inf
 
     def solve(self, p_occupied: NDArray[np.floating]) -> Labels:
-        """Make the optimal plan for a belief.
-
-        Args:
-            p_occupied: (n_slots,) P(taken).
-        """
+        """Make the optimal plan for a belief, (n_slots,) P(taken)."""
         n_slots = self.problem.lot.n_slots
         if p_occupied.shape != (n_slots,):
             raise InputError(f"p_occupied has shape {p_occupied.shape}, want ({n_slots},)")
