@@ -73,9 +73,9 @@ def best_path(
 ) -> PathChoice:
     """Search for the path with the least expected time, starting from the path of the last decision.
 
-    `course` is that of the last decision, without `heading` where its slot was observed since. `remaining_s` is the
-    time expected to remain on that path, or inf if something was observed since: the path is kept unless another is better
-    than this. Estimates depend on the position of the car, so it could turn round for ever. `paths` are buffers, one
+    `course` is that of the last decision, without `heading` where its slot was observed since; `remaining_s` the time
+    expected to remain on that path, or inf if something was observed since. The path is kept unless another is better
+    than this: estimates depend on the position of the car, so it could turn round for ever. `paths` are buffers, one
     more than there are failure costs.
     """
     # Nearest vertices first: with a small budget they matter most for the next step.

@@ -20,7 +20,7 @@ from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.keyed_random import OBSERVATION_STREAM, VIEW_STREAM, keyed_uniform
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_whole
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.scenario import SearchProblem
@@ -86,8 +86,7 @@ def tune_failure_cost(
         raise InputError(f"p_occupied has shape {p.shape}, want {problem.lot.n_slots} probabilities")
     if not len(compared) or not (np.isfinite(compared) & (compared > 0.0)).all():
         raise InputError(f"costs are {list(costs)}, want finite seconds above 0")
-    if worlds < 1:
-        raise InputError(f"worlds is {worlds}, want at least 1")
+    require_whole("worlds", worlds, least=1)
     near = near or Neighborhoods(problem).toward(vertex)
     here = near.index(vertex)
     start = here if here >= 0 else near.index(near.entry)
@@ -103,7 +102,8 @@ def tune_failure_cost(
     keys = rng.integers(1 << 63, size=worlds, dtype=np.uint64)
     # The actual cost of a failed attempt in these worlds; the costs that are compared are the planner's.
     graph = near.planning_graph(problem, problem.failure_s)
-    return Tuning(compared, _mean_times(start, taken, keys, p, compared, graph))
+    odds = np.divide(p, 1.0 - p, out=np.full(len(p), np.inf), where=p < 1.0)
+    return Tuning(compared, _mean_times(start, taken, keys, odds, compared, graph))
 
 
 @compiled
@@ -111,20 +111,16 @@ def _mean_times(
     vertex: int,
     taken: NDArray[np.bool_],
     keys: NDArray[np.uint64],
-    p_occupied: FloatArray,
+    odds: FloatArray,
     costs: FloatArray,
     graph: PlanningGraph,
 ) -> FloatArray:
     """Return the planner's mean total time, (k,) s, at each failure cost over worlds, (n_worlds, n_slots) bool."""
-    n_worlds, n = taken.shape
     mean = np.zeros(len(costs))
-    odds, seen_taken = np.empty(n), np.empty(n, np.bool_)
     for c in range(len(costs)):
-        for w in range(n_worlds):
-            seen_taken[:] = False
-            for s in range(n):
-                odds[s] = p_occupied[s] / (1.0 - p_occupied[s]) if p_occupied[s] < 1.0 else np.inf
-            mean[c] += _total_time(vertex, taken[w], keys[w], costs[c], graph, odds, seen_taken) / n_worlds
+        for w in range(len(taken)):
+            total_s = _total_time(vertex, taken[w], keys[w], costs[c], graph, odds.copy())
+            mean[c] += total_s / len(taken)
     return mean
 
 
@@ -136,14 +132,10 @@ def _total_time(
     cost: float,
     graph: PlanningGraph,
     odds: FloatArray,
-    seen_taken: NDArray[np.bool_],
 ) -> float:
-    """Return the total time, s, of the thesis's planner in one world.
-
-    The belief `odds` = P(taken)/P(free) and `seen_taken`, whether each slot's last observation showed it taken, are
-    changed in place.
-    """
+    """Return the total time, s, of the thesis's planner in one world; its belief `odds`, P(taken)/P(free), changes."""
     total, n_taken = 0.0, 0
+    seen_taken = np.zeros(len(taken), np.bool_)  # by each slot's last observation
     for step in range(_MOST_STEPS):
         target, value = _best_target(vertex, cost, graph, odds)
         if target < 0 or not value < np.inf:
@@ -165,9 +157,8 @@ def _total_time(
             # What is certain stays so: slots do not change. Occlusions persist, as in the environment.
             if odds[s] == 0.0 or odds[s] == np.inf or keyed_uniform(key, VIEW_STREAM, s, 0) >= view.rate:
                 continue
-            reported = keyed_uniform(key, OBSERVATION_STREAM, s, step) < (
-                view.hit if taken[s] else view.false_alarm
-            )
+            p_reported = view.hit if taken[s] else view.false_alarm
+            reported = keyed_uniform(key, OBSERVATION_STREAM, s, step) < p_reported
             if_taken, if_free = view.hit, view.false_alarm
             if not reported:
                 if_taken, if_free = 1.0 - if_taken, 1.0 - if_free
@@ -238,34 +229,23 @@ class TunedAgent(SearchAgent[TunedPlan]):
     ) -> None:
         super().__init__(problem)
         require_observations(self.name, problem)
-        if worlds < 1:
-            raise InputError(f"worlds is {worlds}, want at least 1")
+        require_whole("worlds", worlds, least=1)
         self.worlds, self.seed, self.gamma = worlds, seed, gamma
         self._neighborhoods = Neighborhoods(self.problem, most_vertices)
         self._routes = DriveRoutes(self.problem)
         self._planners: dict[float, ReplanningAgent] = {}
         self._tuned: OrderedDict[tuple[int, DayError, bytes], Tuning] = OrderedDict()
 
-    def tuning(
-        self,
-        p_occupied: NDArray[np.floating],
-        vertex: int,
-        day_error: DayError = EXACT,
-    ) -> Tuning:
+    def tuning(self, p_occupied: NDArray[np.floating], vertex: int, day_error: DayError = EXACT) -> Tuning:
         """Return the simulation for a forecast, (n_slots,), and a start vertex; results are cached."""
         # Forecasts are rounded to a percent, so arrivals within minutes of each other share a result.
         near = self._neighborhoods.toward(vertex)
         rounded = np.round(np.asarray(p_occupied, dtype=np.float64), 2)
         key = vertex, day_error, rounded[near.slots].tobytes()
         if key not in self._tuned:
+            p = np.clip(rounded, 0.001, 0.999)
             self._tuned[key] = tune_failure_cost(
-                self.problem,
-                np.clip(rounded, 0.001, 0.999),
-                vertex,
-                worlds=self.worlds,
-                seed=self.seed,
-                near=near,
-                day_error=day_error,
+                self.problem, p, vertex, worlds=self.worlds, seed=self.seed, near=near, day_error=day_error
             )
             if len(self._tuned) > _KEPT:
                 self._tuned.popitem(last=False)
