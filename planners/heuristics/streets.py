@@ -34,7 +34,6 @@ from parkenv.compiled.memory import (
     ADDRESS,
     float64_array,
     float64s,
-    int32_array,
     int32s,
     int64s,
     record_at,
@@ -97,8 +96,11 @@ STREETS = np.dtype(
         # is reached, and the position on it from which that was entered, -1 for its beginning; (n_junctions + 1,)
         # int32, how many junctions it reached, and then these.
         *addresses("seconds via via_from reached"),
-        # A heap: (n_streets + 8,) float64 keys, int32 junctions.
+        # A heap: (n_streets + 8,) float64 keys, int32 junctions; how many there are, and where the driver's bounds by
+        # junction are.
         *addresses("keys vertices"),
+        ("n_queued", np.int64),
+        ("bounds_s", ADDRESS),
         # Best place so far: its index, s; int32 position of the target, its street, position from which that is
         # entered.
         ("best_s", np.float64),
@@ -315,42 +317,39 @@ def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
     """Find the place of the lowest index from a vertex (A* over the junctions)."""
     n, seconds, reached = streets.n_slots, float64s(streets.seconds), int32s(streets.reached)
     street_of, end, length_s = int32s(streets.street_of), int32s(streets.end), float64s(streets.length_s)
-    room = streets.n_streets + 2 * _N_MOVES
-    keys, vertices = float64_array(streets.keys, (room,)), int32_array(streets.vertices, (room,))
-    onward_at, more_s = _onward_s(streets, goal, search)
-    onward_s = float64s(onward_at)
+    keys, vertices = float64s(streets.keys), int32s(streets.vertices)
+    streets.bounds_s, more_s = _onward_s(streets, goal, search)
+    onward_s = float64s(streets.bounds_s)
     for i in range(1, reached[0] + 1):
         seconds[reached[i]] = np.inf
     reached[0] = 0
-    streets.best_s, streets.best = np.inf, _NONE
+    streets.best_s, streets.best, streets.n_queued = np.inf, _NONE, 0
     _count_free(streets, search)
-    size = 0
     if vertex >= n:
         seconds[vertex - n], reached[0], reached[1] = 0.0, 1, vertex - n
-        size = push(keys, vertices, size, onward_s[vertex - n], vertex - n)
+        streets.n_queued = push(keys, vertices, 0, onward_s[vertex - n], vertex - n)
     else:
         # On along the street, or across it.
         here = np.int64(int32s(streets.position)[vertex])
-        size = _enter(streets, goal, search, here, 0.0, onward_at, keys, vertices, size)
+        _enter(streets, goal, search, here, 0.0)
         for move in range(_N_MOVES):
             v = np.int64(int32s(streets.neighbors)[vertex * _N_MOVES + move])
             if 0 <= v < n and not _follows(streets, here, v):
                 there = np.int64(int32s(streets.position)[v])
-                drive_s = float64s(streets.move_s)[vertex * _N_MOVES + move]
-                size = _enter(streets, goal, search, there, drive_s, onward_at, keys, vertices, size)
-    while size > 0:
+                _enter(streets, goal, search, there, float64s(streets.move_s)[vertex * _N_MOVES + move])
+    while streets.n_queued > 0:
         least_s, junction = keys[0], np.int64(vertices[0])
         if least_s + more_s >= streets.best_s:
             break
-        size, far = pop(keys, vertices, size), seconds[junction]
+        far = seconds[junction]
+        streets.n_queued = pop(keys, vertices, streets.n_queued)
         if least_s > far + onward_s[junction]:
             continue
         for move in range(_N_MOVES):
             street = np.int64(street_of[junction * _N_MOVES + move])
             if street != _NONE:
                 _look_along(streets, goal, search, street, _NONE, far)
-                reached_s, end_at = far + length_s[street], end[street] - n
-                size = _reach(streets, end_at, street, _NONE, reached_s, onward_at, keys, vertices, size)
+                _reach(streets, end[street] - n, street, _NONE, far + length_s[street])
 
 
 @inlined_rule
@@ -361,47 +360,28 @@ def _follows(streets: Any, position: int, slot: int) -> bool:
 
 
 @rule
-def _enter(
-    streets: Any,
-    goal: int,
-    search: int,
-    position: int,
-    drive_s: float,
-    onward_at: int,
-    keys: FloatArray,
-    vertices: NDArray[np.int32],
-    size: int,
-) -> int:
-    """Begin a search amid a street; returns the size of the heap."""
+def _enter(streets: Any, goal: int, search: int, position: int, drive_s: float) -> None:
+    """Begin a search amid a street."""
     street, before_s = np.int64(int32s(streets.street_at)[position]), float64s(streets.along_s)[position]
     _look_along(streets, goal, search, street, position, drive_s - before_s)
     end_s = drive_s - before_s + float64s(streets.length_s)[street]
-    junction = np.int64(int32s(streets.end)[street] - streets.n_slots)
-    return int(_reach(streets, junction, street, position, end_s, onward_at, keys, vertices, size))
+    _reach(streets, np.int64(int32s(streets.end)[street] - streets.n_slots), street, position, end_s)
 
 
 @inlined_rule
-def _reach(
-    streets: Any,
-    junction: int,
-    street: int,
-    position: int,
-    far: float,
-    onward_at: int,
-    keys: FloatArray,
-    vertices: NDArray[np.int32],
-    size: int,
-) -> int:
-    """Note that a street, entered at a position or -1, leads to a junction; returns the size of the heap."""
+def _reach(streets: Any, junction: int, street: int, position: int, far: float) -> None:
+    """Note that a street, entered at a position or -1, leads to a junction."""
     seconds, reached = float64s(streets.seconds), int32s(streets.reached)
     if far >= seconds[junction]:
-        return size
+        return
     if seconds[junction] == np.inf:
         reached[0] += 1
         reached[reached[0]] = junction
     seconds[junction] = far
     int32s(streets.via)[junction], int32s(streets.via_from)[junction] = street, position
-    return int(push(keys, vertices, size, far + float64s(onward_at)[junction], junction))
+    keys, vertices = float64s(streets.keys), int32s(streets.vertices)
+    bound_s = far + float64s(streets.bounds_s)[junction]
+    streets.n_queued = push(keys, vertices, streets.n_queued, bound_s, junction)
 
 
 @rule
