@@ -140,7 +140,7 @@ def predict_each(
     Return the actions, one or with a leading axis, and the states.
     """
     if np.ndim(observation[key]) == n_axes:
-        starts = episode_start is not None and np.any(episode_start)
+        starts = episode_start is not None and bool(np.any(episode_start))
         return predict_one(observation, None if starts else state)
     n = len(observation[key])
     states = [None] * n if state is None else list(state)

@@ -326,7 +326,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         vars(memory).update(vars(new))
         memory.entry = -1 if near.entry == vertex else near.entry
         known = self._update(belief, vertex, memory)
-        memory.n_unobserved = np.count_nonzero(memory.state == UNOBSERVED)
+        memory.n_unobserved = int(np.count_nonzero(memory.state == UNOBSERVED))
         return known
 
     def plan_preview(self, observation: Observation, action: int, memory: BeliefSearch) -> PlanPreview:

@@ -81,7 +81,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(phi - t)
         if t < -_EDGE or v < -_EDGE:
             return 0
-        return _word((t, u, v), (LEFT, STRAIGHT, LEFT), piece, turn)
+        return int(_word((t, u, v), (LEFT, STRAIGHT, LEFT), piece, turn))
     if number == 1:  # L S R
         square = across * across + down * down
         if square < 4.0:
@@ -91,7 +91,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(t - phi)
         if t < -_EDGE or v < -_EDGE:
             return 0
-        return _word((t, u, v), (LEFT, STRAIGHT, RIGHT), piece, turn)
+        return int(_word((t, u, v), (LEFT, STRAIGHT, RIGHT), piece, turn))
     if number == 2:  # L R- L, with the last turn in either direction
         far = math.hypot(ahead, left)
         if far > 4.0:
@@ -101,7 +101,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(phi - t + u)
         if t < -_EDGE or u > _EDGE:
             return 0
-        return _word((t, u, v), (LEFT, RIGHT, LEFT), piece, turn)
+        return int(_word((t, u, v), (LEFT, RIGHT, LEFT), piece, turn))
     if number == 3:  # L R L- R-
         share = 0.25 * (2.0 + math.hypot(across, down))
         if share > 1.0:
@@ -110,7 +110,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         t, v = _outer(u, -u, across, down, phi)
         if t < -_EDGE or v > _EDGE:
             return 0
-        return _word((t, u, -u, v), (LEFT, RIGHT, LEFT, RIGHT), piece, turn)
+        return int(_word((t, u, -u, v), (LEFT, RIGHT, LEFT, RIGHT), piece, turn))
     if number == 4:  # L R- L- R
         share = (20.0 - across * across - down * down) / 16.0
         if share < 0.0 or share > 1.0:
@@ -119,7 +119,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         t, v = _outer(u, u, across, down, phi)
         if u < -_HALF or t < -_EDGE or v < -_EDGE:
             return 0
-        return _word((t, u, u, v), (LEFT, RIGHT, LEFT, RIGHT), piece, turn)
+        return int(_word((t, u, u, v), (LEFT, RIGHT, LEFT, RIGHT), piece, turn))
     if number == 5:  # L R- S- L-
         far = math.hypot(ahead, left)
         if far < 2.0:
@@ -130,7 +130,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(phi - _HALF - t)
         if t < -_EDGE or u > _EDGE or v > _EDGE:
             return 0
-        return _word((t, -_HALF, u, v), (LEFT, RIGHT, STRAIGHT, LEFT), piece, turn)
+        return int(_word((t, -_HALF, u, v), (LEFT, RIGHT, STRAIGHT, LEFT), piece, turn))
     if number == 6:  # L R- S- R-
         far = math.hypot(across, down)
         if far < 2.0:
@@ -140,7 +140,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
         v = _turned(t + _HALF - phi)
         if t < -_EDGE or u > _EDGE or v > _EDGE:
             return 0
-        return _word((t, -_HALF, u, v), (LEFT, RIGHT, STRAIGHT, RIGHT), piece, turn)
+        return int(_word((t, -_HALF, u, v), (LEFT, RIGHT, STRAIGHT, RIGHT), piece, turn))
     # L R- S- L- R
     far = math.hypot(across, down)
     if far < 2.0:
@@ -152,7 +152,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
     v = _turned(t - phi)
     if t < -_EDGE or v < -_EDGE:
         return 0
-    return _word((t, -_HALF, u, -_HALF, v), (LEFT, RIGHT, STRAIGHT, LEFT, RIGHT), piece, turn)
+    return int(_word((t, -_HALF, u, -_HALF, v), (LEFT, RIGHT, STRAIGHT, LEFT, RIGHT), piece, turn))
 
 
 @compiled(error_model="numpy")
