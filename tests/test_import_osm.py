@@ -26,7 +26,6 @@ from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.show.figures.lot_import import SOURCE_COLORS
 from parkenv.show.figures.schematic import TWO_WAY
 from parkenv.world.drive_graph import SLOT_REACH
-from parkenv.world.lot import Mouth
 
 
 def street_slots(tmp_path, **tags):
@@ -97,37 +96,12 @@ def test_there_and_back_on_the_globe_is_less_than_a_centimetre(lon, lat, x, y):
     np.testing.assert_allclose(frame.to_xy(frame.to_lonlat([[x, y]])), [[x, y]], atol=0.01)
 
 
-def test_mapped_spaces_become_slots_at_their_place(tmp_path):
-    draft = car_park().draft(tmp_path)
-    lot = draft.lot()
-    assert lot.n_slots == 22
-    xy = in_map_metres(draft, lot.slot_xy)
-    first = lot.slot_ids.index("way/4")
-    np.testing.assert_allclose(xy[first], [9.25, 5.5], atol=0.05)
-    assert lot.slot_length[first] == pytest.approx(5.0, abs=0.05)
-    assert lot.slot_width[first] == pytest.approx(2.5, abs=0.05)
-    assert np.sin(lot.slot_yaw[first]) == pytest.approx(1.0, abs=1e-3)  # nose away from the aisle
-    assert set(lot.slot_mouth.tolist()) == {Mouth.REAR}
-
-
 def test_disabled_spaces_are_left_out_and_listed_unless_asked_for(tmp_path):
     draft = car_park().draft(tmp_path)
     assert reasons(draft) == {"spaces for disabled drivers": ("way/5", "way/7")}
     asked = car_park().draft(tmp_path, with_disabled=True)
     assert len(asked.slots) == 24
     assert reasons(asked) == {}
-
-
-def test_kerbs_hold_a_slot_every_six_metres_on_the_tagged_side(tmp_path):
-    for side, y in (("right", -4.05), ("left", 4.05)):
-        draft, xy = street_slots(tmp_path, **{f"parking:{side}": "lane"})
-        assert len(draft.slots) == 16  # 100 m
-        np.testing.assert_allclose(xy[:, 1], y, atol=0.01)
-        # Cars stand as traffic runs, on the right.
-        np.testing.assert_allclose(np.cos(draft.slots.yaw), 1.0 if side == "right" else -1.0, atol=1e-4)
-        assert set(draft.slots.mouth.tolist()) == {Mouth.LEFT}
-    both, _ = street_slots(tmp_path, **{"parking:both": "lane"})
-    assert len(both.slots) == 32
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.areas import (
     CAR_SPACES,
+    Area,
     is_building,
     is_parking_area,
     is_space,
@@ -79,6 +80,7 @@ RESERVED_PLACES = ("disabled", "charging")
 """Classes of users whose places a car park may count apart: `capacity:disabled`, `capacity:charging`."""
 PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
 """Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it."""
+NO_GOAL = "no goal: no building and no point of interest in it; export buildings and shops, too"
 CLOSED = ("no", "military", "forestry", "agricultural")
 """Values of `access` of parking that no car in town may use."""
 
@@ -185,8 +187,6 @@ class _TownImport(MapImport):
         self.names.add(name)
         return name
 
-    # ---- supply ----
-
     def read_drawn(self) -> None:
         """Read the spaces that are drawn one by one, grouped by the car park around them, else by their distance."""
         spaces = []
@@ -269,12 +269,12 @@ class _TownImport(MapImport):
         blocked[shapely.STRtree(corridors).query(slots.boxes(shrink=0.05), predicate="intersects")[0]] = True
         drawn = Slots.joined([*(row.slots for row in self.rows), NO_SLOTS])
         boxes = np.concatenate([drawn.boxes(MAPPED_OVERLAP), slots.boxes(RULE_OVERLAP)])
-        kept = without_overlaps(boxes)[len(drawn) :] & ~blocked
-        lost = np.bincount(of[~kept], minlength=len(rows))
+        is_free = without_overlaps(boxes)[len(drawn) :] & ~blocked
+        lost = np.bincount(of[~is_free], minlength=len(rows))
         self.left_out["kerbs with fewer places, because of streets and other places"] += [
             rows[k].element for k in np.flatnonzero(lost).tolist()
         ]
-        slots, of = slots[np.flatnonzero(kept)], of[kept]
+        slots, of = slots[np.flatnonzero(is_free)], of[is_free]
         for row, start, end in zip(
             rows, *np.searchsorted(of, [range(len(rows)), range(1, len(rows) + 1)]), strict=True
         ):
@@ -288,7 +288,7 @@ class _TownImport(MapImport):
         entrances = [self.frame.to_xy(e.lines[0])[0] for e in ways_in]
         points = [
             (e, shapely.Point(self.frame.to_xy(e.lines[0])[0]), None)
-            for e in (*self.nodes, *self._unseen_garages(ways_in, entrances))
+            for e in (*self.nodes, *_unseen_garages(self.parking, ways_in, entrances))
             if is_parking_area(e) and self._is_open(e)
         ]
         outlines = [
@@ -309,11 +309,11 @@ class _TownImport(MapImport):
                     element.id
                 )
                 continue
-            said = whole_number(tags.get("capacity"))
-            capacity = said or expected_capacity(rule, area, levels_of(tags))
-            source, which = ("tag", "") if said else ("rule", rule)
+            tagged = whole_number(tags.get("capacity"))
+            capacity = tagged or expected_capacity(rule, area, levels_of(tags))
+            source, which = ("tag", "") if tagged else ("rule", rule)
             name = self._named(tags, element.id)
-            row = FacilityRow(name, kind, rules, source, which, element.id, said, xy=xy)
+            row = FacilityRow(name, kind, rules, source, which, element.id, tagged, xy=xy)
             rest = capacity
             for users in RESERVED_PLACES:
                 n = whole_number(tags.get(f"capacity:{users}")) or 0
@@ -327,54 +327,31 @@ class _TownImport(MapImport):
         """Give the car parks of a list their names and capacities; those that the map lacks are garages of it."""
         of_map = [row for row in self.rows if row.kind != "kerb" and row.xy is not None]
         places = np.array([len(row.slots) + sum(n for _, n, _ in row.counted) for row in of_map], np.float64)
-        at = self.frame.to_xy([(one.lon, one.lat) for one in listed])
+        at = self.frame.to_xy([(car_park.lon, car_park.lat) for car_park in listed])
         xy = np.array([row.xy for row in of_map]).reshape(-1, 2)
         same = matched(listed, at, [row.name for row in of_map], places, xy)
-        for one, point, k in zip(listed, at, same.tolist(), strict=True):
+        for car_park, point, k in zip(listed, at, same.tolist(), strict=True):
             if k < 0:
                 xy_of = self._entrance(shapely.Point(point), [])
-                if xy_of is None or not one.capacity:
+                if xy_of is None or not car_park.capacity:
                     self.left_out[
                         "car parks of the list that the map lacks, without a street or a capacity"
-                    ].append(one.name)
+                    ].append(car_park.name)
                     continue
-                row = FacilityRow(one.name, "garage", Rules(), "list", "", "", xy=xy_of)
+                row = FacilityRow(car_park.name, "garage", Rules(), "list", "", "", xy=xy_of)
                 self.rows.append(row)
             else:
                 row = of_map[k]
-                self.listed.append(f"{one.name}: {row.name}, {places[k]:.0f} places in the map")
+                self.listed.append(f"{car_park.name}: {row.name}, {places[k]:.0f} places in the map")
             # It is counted as a whole, open to everybody, and cars stand there when it is closed, too.
-            capacity = one.capacity or int(places[k])
+            capacity = car_park.capacity or int(places[k])
             self.names.discard(row.name)
-            row.name = self._named({"name": one.name}, row.element)
+            row.name = self._named({"name": car_park.name}, row.element)
             row.slots, row.slot_rules = NO_SLOTS, []
             paid = {} if row.rules.per_hour else PAID
             row.rules = replace(row.rules, users=PUBLIC, hours="", **paid)
             row.counted = [(row.name, capacity, row.rules)]
             row.capacity_from, row.rule = "list", ""
-
-    def _unseen_garages(
-        self, ways_in: Sequence[OsmElement], at: Sequence[FloatArray]
-    ) -> Iterator[OsmElement]:
-        """Yield a garage for each group of entrances without an outline near: a large one if it has several."""
-        if not ways_in:
-            return
-        points = np.asarray(shapely.points(np.array(at)))
-        alone = np.ones(len(points), bool)
-        garages = [a.polygon for a in self.parking if rule_of(a.element.tags) in GARAGES]
-        for outlines, reach in (([a.polygon for a in self.parking], ENTRANCE_WITHIN), (garages, SAME_GARAGE)):
-            known = shapely.STRtree(outlines).query(points, predicate="dwithin", distance=reach)[0]
-            alone[known] = False
-        index = np.flatnonzero(alone)
-        label = component_labels(
-            shapely.STRtree(points[index]).query(points[index], predicate="dwithin", distance=SAME_GARAGE).T,
-            len(index),
-        )
-        for k in range(int(label.max(initial=-1)) + 1):
-            group = [ways_in[i] for i in index[label == k].tolist()]
-            tags = {key: value for e in reversed(group) for key, value in e.tags.items()}
-            usual = "multi-storey" if len(group) > 1 else "underground"
-            yield replace(group[0], tags={"parking": usual, **tags, "amenity": "parking"})
 
     def _entrance(
         self, shape: shapely.Geometry, entrances: Sequence[FloatArray]
@@ -389,8 +366,6 @@ class _TownImport(MapImport):
             return None
         at = shapely.get_coordinates(shapely.shortest_line(shape, self.lines[int(index[0])]))[0]
         return float(at[0]), float(at[1])
-
-    # ---- the town ----
 
     def draft(self) -> TownDraft:
         """Assemble lanes, slots, facilities, zones, entries and goals."""
@@ -440,7 +415,10 @@ class _TownImport(MapImport):
                 for a in self.parking
                 for part in shapely.get_parts(a.polygon)
             ),
-            missing=tuple(self._missing(entries, goals)),
+            missing=(
+                *(() if len(entries) else ("no entry: no street crosses the edge of the map",)),
+                *(() if len(goals) else (NO_GOAL,)),
+            ),
             frame=self.frame,
             facilities=tuple(facilities),
             zone_rules=zones_of(used),
@@ -457,35 +435,54 @@ class _TownImport(MapImport):
             *turns.left_out,
             *draft.left_out,
         )
-        found = (*self._found(rows, draft), *turns.found, *cut_elements(self.place.elements))
+        found = (*_findings(self, rows, draft), *turns.found, *cut_elements(self.place.elements))
         guesses = tuple(_guesses(rows, draft))
         return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows)
 
-    def _missing(self, entries: FloatArray, goals: FloatArray) -> Iterator[str]:
-        if not len(entries):
-            yield "no entry: no street crosses the edge of the map"
-        if not len(goals):
-            yield "no goal: no building and no point of interest in it; export buildings and shops, too"
 
-    def _found(self, rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
-        whole, connected = self.streets.length.sum() / 1e3, self.streets.connected_share()
-        yield f"streets: {whole:.0f} km, {connected:.1%} of them connected; lanes: {len(draft.lanes)}"
-        yield f"speed limits: {self.streets.tagged_limits():.0%} of the streets by tag, others by class"
-        for kind in ("kerb", "lot", "garage"):
-            mine = [row for row in rows if row["kind"] == kind]
-            places = {
-                source: sum(r["capacity"] for r in mine if r["capacity_from"] == source)
-                for source in ("tag", "drawn", "list", "rule")
-            }
-            listed = ", ".join(f"{source}: {n:,}" for source, n in places.items() if n)
-            yield f"{kind}s: {len(mine):,}, places: {sum(places.values()):,}" + (
-                f" ({listed})" if listed else ""
-            )
-        yield f"entries: {len(draft.entries)}, where streets cross the edge of the map"
-        yield f"goals: {len(draft.goals)}, of buildings and points of interest"
-        yield f"zones: {', '.join(draft.zone_rules)}"
-        yield from (f"of the list: {line}" for line in self.listed)
-        yield f"frame: {self.frame}"
+def _unseen_garages(
+    parking: Sequence[Area], ways_in: Sequence[OsmElement], at: Sequence[FloatArray]
+) -> Iterator[OsmElement]:
+    """Yield a garage for each group of entrances without an outline near: a large one if it has several."""
+    if not ways_in:
+        return
+    points = np.asarray(shapely.points(np.array(at)))
+    alone = np.ones(len(points), bool)
+    garages = [a.polygon for a in parking if rule_of(a.element.tags) in GARAGES]
+    for outlines, reach in (([a.polygon for a in parking], ENTRANCE_WITHIN), (garages, SAME_GARAGE)):
+        known = shapely.STRtree(outlines).query(points, predicate="dwithin", distance=reach)[0]
+        alone[known] = False
+    index = np.flatnonzero(alone)
+    label = component_labels(
+        shapely.STRtree(points[index]).query(points[index], predicate="dwithin", distance=SAME_GARAGE).T,
+        len(index),
+    )
+    for k in range(int(label.max(initial=-1)) + 1):
+        group = [ways_in[i] for i in index[label == k].tolist()]
+        tags = {key: value for e in reversed(group) for key, value in e.tags.items()}
+        usual = "multi-storey" if len(group) > 1 else "underground"
+        yield replace(group[0], tags={"parking": usual, **tags, "amenity": "parking"})
+
+
+def _findings(town: _TownImport, rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
+    whole, connected = town.streets.length.sum() / 1e3, town.streets.connected_share()
+    yield f"streets: {whole:.0f} km, {connected:.1%} of them connected; lanes: {len(draft.lanes)}"
+    yield f"speed limits: {town.streets.tagged_limits():.0%} of the streets by tag, others by class"
+    for kind in ("kerb", "lot", "garage"):
+        of_kind = [row for row in rows if row["kind"] == kind]
+        places = {
+            source: sum(r["capacity"] for r in of_kind if r["capacity_from"] == source)
+            for source in ("tag", "drawn", "list", "rule")
+        }
+        listed = ", ".join(f"{source}: {n:,}" for source, n in places.items() if n)
+        yield f"{kind}s: {len(of_kind):,}, places: {sum(places.values()):,}" + (
+            f" ({listed})" if listed else ""
+        )
+    yield f"entries: {len(draft.entries)}, where streets cross the edge of the map"
+    yield f"goals: {len(draft.goals)}, of buildings and points of interest"
+    yield f"zones: {', '.join(draft.zone_rules)}"
+    yield from (f"of the list: {line}" for line in town.listed)
+    yield f"frame: {town.frame}"
 
 
 def _guesses(rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
