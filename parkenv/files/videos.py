@@ -98,7 +98,7 @@ class Video:
 
 
 @contextmanager
-def film(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[Image], None]]:
+def film(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[Image], object]]:
     """Yield a function that appends a frame, (h, w, 3) uint8, RGB, to a film (`.mp4`), which is written atomically.
 
     An odd last row or column of `size`, width and height in px, is left out, as encoders want.
