@@ -75,7 +75,7 @@ class CommuteRun:
     number: int  # of the repetition, from 0
     fleet: int  # number of drivers
     seed: int
-    before: Sequence[Trip] = ()  # all trips of the days before those to run
+    before: Sequence[Trip] = ()  # all trips so far, of which those of earlier days are known
 
     @property
     def learns(self) -> bool:
@@ -109,7 +109,7 @@ class CommuteRun:
         known = self.start_map()
         agent = make_agent(self.agent.name, self.scenario, **self.agent.options)
         if isinstance(known, LearnedMap):
-            known.learn(self.before)
+            known.learn([trip for trip in self.before if trip.time < days[0].count * DAY_S])
         for day in days:
             if isinstance(known, LearnedMap):
                 known.pass_time(day.count)

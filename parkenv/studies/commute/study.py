@@ -143,19 +143,16 @@ class Commute(Study):
     def stages(self, results: Results) -> Iterator[Stage]:
         """See `Study`: a block of days needs the maps of the days before."""
         from parkenv.mapping.store import MapStore
-        from parkenv.mapping.trips import Trip
         from parkenv.studies.commute.runs import map_file
-        from parkenv.world.week import DAY_S
 
         for first in range(0, self.days, self.block):
             doing = f"{self.doing}, days {first + 1} to {min(first + self.block, self.days)}"
             cells = []
             for run, days in self.cells():
-                block, before = days[first : first + self.block], list[Trip]()
-                if run.learns and block:
+                if run.learns:
                     with MapStore(map_file(results.path, run), run.scenario.lot) as store:
-                        before = [trip for trip in store.trips() if trip.time < block[0].count * DAY_S]
-                cells.append(Cell(replace(run, before=before), block))
+                        run = replace(run, before=store.trips())
+                cells.append(Cell(run, days[first : first + self.block]))
             yield Stage(doing, self, cells)
 
     def run(self, work: CommuteRun, items: Sequence[Day]) -> list[Row]:
