@@ -35,7 +35,7 @@ LINKED = (
     "rewards",
     "starting-state",
     "episode-end",
-    "places",
+    "several-scenarios",
     "arguments",
 )
 """Anchors of the page of `parkenv/Search-v2` to which the other pages link."""

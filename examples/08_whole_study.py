@@ -18,7 +18,7 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.sensing.surveys import session_row, summarize
 from parkenv.studies.statistics import mean_interval
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.occupancy.constant_map import FlatMap
+from parkenv.world.occupancy.constant_map import ConstantForecast
 
 lot = grid_lot(4, 20)
 world = make_scenario(lot, arrival=ArrivalWindow.parse("11:00-13:00"))
@@ -38,7 +38,7 @@ found, right = surveyed["car_detection_rate"], surveyed["slot_accuracy"]
 print(f"3 drives: {found:.1%} of the cars found, {right:.1%} of the slots judged right")
 
 maps = {
-    "no map": FlatMap(0.5, world.occupancy),
+    "no map": ConstantForecast(0.5, world.occupancy),
     "3 drives": map_prior(log, (), lot.walk_m(world.goal)),
     "the truth": None,
 }

@@ -43,37 +43,28 @@ if sys.flags.safe_path:
     skip_settings()
 
 _EXPORTS = {
-    "ArrivalWindow": "parkenv.world.occupancy.arrival_window",
-    "InputError": "parkenv.errors",
-    "Lane": "parkenv.world.lot",
-    "Mouth": "parkenv.world.lot",
-    "OccupancyLog": "parkenv.world.occupancy.log",
-    "OccupancyProcess": "parkenv.world.occupancy.process",
-    "ParkingLot": "parkenv.world.lot",
-    "RecordedOccupancy": "parkenv.world.occupancy.recorded",
-    "Result": "parkenv.studies.runner",
-    "Scenario": "parkenv.world.scenario",
-    "SearchProblem": "parkenv.world.scenario",
-    "SensorBand": "parkenv.world.sensor_model",
-    "SensorModel": "parkenv.world.sensor_model",
-    "Traffic": "parkenv.world.traffic",
-    "Turn": "parkenv.world.lot",
-    "compare": "parkenv.studies.verbs",
-    "curve": "parkenv.studies.verbs",
-    "fleet": "parkenv.studies.verbs",
-    "import_lot": "parkenv.lots",
-    "load_curves": "parkenv.studies.curve.curves",
-    "load_lot": "parkenv.lots",
-    "make_agent": "planners.agent",
-    "make_scenario": "parkenv.scenarios.build",
-    "make_scenarios": "parkenv.scenarios.build",
-    "model": "parkenv.engine.model",
-    "open_run": "parkenv.studies.runner",
-    "simulate": "parkenv.studies.simulate",
-    "survey": "parkenv.studies.verbs",
-    "train": "parkenv.studies.verbs",
+    name: module
+    for module, names in {
+        "parkenv.engine.model": ("model",),
+        "parkenv.errors": ("InputError",),
+        "parkenv.lots": ("import_lot", "load_lot"),
+        "parkenv.scenarios.build": ("make_scenario", "make_scenarios"),
+        "parkenv.studies.curve.curves": ("load_curves",),
+        "parkenv.studies.runner": ("Result", "open_run"),
+        "parkenv.studies.simulate": ("simulate",),
+        "parkenv.studies.verbs": ("compare", "curve", "fleet", "survey", "train"),
+        "parkenv.world.lot": ("Lane", "Mouth", "ParkingLot", "Turn"),
+        "parkenv.world.occupancy.arrival_window": ("ArrivalWindow",),
+        "parkenv.world.occupancy.log": ("OccupancyLog",),
+        "parkenv.world.occupancy.process": ("OccupancyProcess",),
+        "parkenv.world.occupancy.recorded": ("RecordedOccupancy",),
+        "parkenv.world.scenario": ("Scenario", "SearchProblem"),
+        "parkenv.world.sensor_model": ("SensorBand", "SensorModel"),
+        "parkenv.world.traffic": ("Traffic",),
+        "planners.agent": ("make_agent",),
+    }.items()
+    for name in names
 }
-
 __all__ = [
     "ArrivalWindow",
     "InputError",
@@ -114,16 +105,8 @@ def __getattr__(name: str) -> Any:
 
 
 for _name, _entry_point, _vector_entry_point in (
-    (
-        "parkenv/Search-v2",
-        "parkenv.envs.search:SearchEnv",
-        "parkenv.envs.search_vector:ParkSearchVectorEnv",
-    ),
-    (
-        "parkenv/SearchSensors-v2",
-        "parkenv.envs.sensors:SearchSensorsEnv",
-        None,
-    ),
+    ("parkenv/Search-v2", "parkenv.envs.search:SearchEnv", "parkenv.envs.search_vector:ParkSearchVectorEnv"),
+    ("parkenv/SearchSensors-v2", "parkenv.envs.sensors:SearchSensorsEnv", None),
     ("parkenv/SearchPerception-v2", "parkenv.envs.perception:SearchPerceptionEnv", None),
 ):
     if _name not in registry:

@@ -126,6 +126,6 @@ def nearest(name: str, known: Iterable[str]) -> str:
         "did you mean 'greedy'? known: mdp, greedy"
     """
     names = list(known)
-    begun = [its for its in names if name and its.startswith(name)]
+    begun = [other for other in names if name and other.startswith(name)]
     close = begun or difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     return (f"did you mean {close[0]!r}? " if close else "") + f"known: {', '.join(names) or 'none'}"

@@ -250,7 +250,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
         self.terminations = dict.fromkeys(self.agents, False)
         self.truncations = dict.fromkeys(self.agents, False)
         self.infos: dict[str, dict[str, Any]] = {
-            agent: {"place": self.scenario.name} for agent in self.agents
+            agent: {"scenario": self.scenario.name} for agent in self.agents
         }
         self._skip_agent_selection = None
         self._select()
@@ -343,7 +343,7 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
         del options
         self.agents = list(self._begin(seed))
         self._observations = {agent: self._blank_observation(_car_of(agent)) for agent in self.agents}
-        self._infos = {agent: {"place": self.scenario.name} for agent in self.agents}
+        self._infos = {agent: {"scenario": self.scenario.name} for agent in self.agents}
         self._tick = 0
         self._advance({}, {})
         return dict(self._observations), dict(self._infos)

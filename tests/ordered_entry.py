@@ -1,16 +1,16 @@
 """The driver of queueing theory: it knows everything, drives in no time and takes the slot that costs least."""
 
 from parkenv.compiled.memory import int64s
-from parkenv.engine.kernel import is_slot_open
 from parkenv.engine.policy import LEAVE, TAKE_SLOT, CompiledPolicy
 from parkenv.engine.records import car_at, fleet_at
+from parkenv.engine.shared_slots import is_slot_open
 from parkenv.world.occupancy.kernel import inlined, kernel
 
 
 @inlined
 def by_distance(fleet, car):
     """Return the slots in order of their distance from the goal, (n_slots,) int64."""
-    return int64s(fleet.by_cost + 8 * fleet.n_slots * car.place)
+    return int64s(fleet.by_cost + 8 * fleet.n_slots * car.scenario_index)
 
 
 @kernel

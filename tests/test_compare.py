@@ -245,7 +245,7 @@ def lot_file(tmp_path):
         (["--resume"], "holds no run to resume"),
         (["-n", "1000000000"], "episodes is 1000000000, want a number of at most"),
         (["--sensor-model", "keen"], "--sensor-model is 'keen', want perfect, blind, laser, stereo or a file (.json)"),
-        (["--sensor-model", "odd.json"], "odd.json: want a sighting model, a JSON object"),
+        (["--sensor-model", "odd.json"], "odd.json: want a sensor model, a JSON object"),
         (["--rig", "radar"], "--rig is 'radar', want 'laser', 'stereo', 'both_sides' or 'camera'"),
     ],
 )  # fmt: skip

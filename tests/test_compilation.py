@@ -17,9 +17,8 @@ import parkenv
 import planners
 import sim_sensors
 from parkenv.compiled import code_files, source_key
-from parkenv.compiled.activity import compiling_now
 from parkenv.compiled.clock import seconds_spent
-from parkenv.compiled.code_files import cache_folder
+from parkenv.compiled.code_files import cache_folder, compiling_now
 from parkenv.compiled.jit import compiled
 
 ROOT = Path(__file__).parents[1]

@@ -149,7 +149,7 @@ def test_a_day_of_zones_has_all_cars_and_what_their_searches_take_beyond_the_dir
     assert sum(row["parked"]) == len(parked)
     assert sum(row["search_s"]) == pytest.approx(beyond_s.sum(), abs=len(row["cars"]))
     places = np.bincount(row["zone"], row["cars"], 6)
-    assert places.tolist() == np.bincount(fleet.cars["place"], minlength=6).tolist()
+    assert places.tolist() == np.bincount(fleet.cars["scenario_index"], minlength=6).tolist()
     demand = np.array(row["town_demand"]) * fleet.scenario.lot.n_slots * [1.0, 0.5]
     assert demand.sum() == pytest.approx(len(fleet.cars), rel=0.01), "the last hour is half of one"
     assert 0.0 < np.min(row["occupancy"]) < np.max(row["occupancy"]) <= 1.0

@@ -19,7 +19,7 @@ from parkenv.driving.drivable_area import DrivableArea
 from parkenv.driving.parking_task import AREA, ParkingTasks
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.drive import CONTROL_S
-from parkenv.envs.drive_goals import goal_errors
+from parkenv.envs.drive_observation import goal_errors
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import corner_points
 from sim_sensors.laser.scanner import LaserScanner

@@ -257,7 +257,7 @@ def test_goals_and_entries_are_drawn_by_weight():
     fleet = Fleet(scenario, demand, drivers=[GREEDY])
     fleet.reset(0)
     assert set(fleet.cars["entry"]) == {scenario.lot.entry_vertices[0]}
-    assert np.mean(fleet.cars["place"] == n_goals - 1) == pytest.approx(2 / (n_goals + 1), abs=0.1)
+    assert np.mean(fleet.cars["scenario_index"] == n_goals - 1) == pytest.approx(2 / (n_goals + 1), abs=0.1)
 
 
 def test_a_forecast_computed_in_python_reaches_every_car():

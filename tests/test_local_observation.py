@@ -175,11 +175,9 @@ def test_it_is_computed_from_observations_alone(sensor):
 
 
 def test_it_has_the_same_size_on_every_lot():
-    sizes = {
-        LocalObservation(gym.make("parkenv/Search-v2", scenario=name), 7).observation_space["local"].shape
-        for name in CAR_PARKS
-    }
-    assert sizes == {(FIRST_NEAR + PER_NEAR * 7,)}
+    for name in CAR_PARKS:
+        env = LocalObservation(gym.make("parkenv/Search-v2", scenario=name), 7)
+        assert env.observation_space["local"].shape == (FIRST_NEAR + PER_NEAR * 7,)
 
 
 def test_a_lot_smaller_than_k_is_told_of_as_far_as_it_goes():

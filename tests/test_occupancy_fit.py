@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 from parkenv.world.week import DAY_S, HOUR_S
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
+COLUMNS = ("slot", "day", "second", "occupied")
 FIRST_MONDAY = np.datetime64("2024-01-01")
 
 
@@ -159,11 +161,7 @@ def test_the_fitted_process_forecasts_the_morning_although_nights_were_not_seen(
 def test_unobserved_hours_take_the_nearest_and_an_unobserved_class_the_other():
     log = simulated_log(constant_process(20, 2e-4, 2e-4), 1, 600.0)
     seen = (log.day < 5) & ((log.second < 9.9 * HOUR_S) | (log.second >= 13 * HOUR_S))
-    fit = fit_process(
-        OccupancyLog(
-            log.slot_ids, log.days, log.slot[seen], log.day[seen], log.second[seen], log.occupied[seen]
-        )
-    )
+    fit = fit_process(replace(log, **{name: getattr(log, name)[seen] for name in COLUMNS}))
     profile = fit.process.arrival_profile
     # The gap from 9:50 to 13:00 is too long to count.
     assert profile[10] == profile[11] == profile[9]
@@ -174,10 +172,7 @@ def test_unobserved_hours_take_the_nearest_and_an_unobserved_class_the_other():
 
 def test_a_slot_that_never_changed_gets_a_finite_rate():
     log = simulated_log(constant_process(10, 2e-4, 2e-4), 1, 600.0)
-    log = OccupancyLog(
-        log.slot_ids, log.days, log.slot, log.day, log.second, np.where(log.slot == 3, True, log.occupied)
-    )
-    process = fit_process(log).process
+    process = fit_process(replace(log, occupied=np.where(log.slot == 3, True, log.occupied))).process
     assert 1e-4 < process.departure_factor[3] < 0.2
 
 
@@ -201,10 +196,6 @@ def seen_in_worlds(log, process, seed):
     return states
 
 
-def with_states(log, states):
-    return OccupancyLog(log.slot_ids, log.days, log.slot, log.day, log.second, states, log.max_gap_s)
-
-
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
 def test_the_day_error_of_many_days_is_recovered(level):
     rng = np.random.default_rng(0)
@@ -213,7 +204,7 @@ def test_the_day_error_of_many_days_is_recovered(level):
         rng.normal(0.5, 1.0, n), np.tile(np.linspace(-1.0, 1.0, 24), 7), 5400.0
     )
     looks = simulated_log(usual, weeks, 3600.0)
-    log = with_states(looks, seen_in_worlds(looks, usual.with_day_error(DayError(level)), seed=1))
+    log = replace(looks, occupied=seen_in_worlds(looks, usual.with_day_error(DayError(level)), seed=1))
     fitted = fit_day_error(log, usual)
     # The prior counts as much as 5.7 of the 105 days.
     assert fitted.level == pytest.approx(np.hypot(level, PRIOR_LEVEL * 0.23), rel=0.12)
@@ -222,15 +213,9 @@ def test_the_day_error_of_many_days_is_recovered(level):
 
 def days_of(log, days):
     chosen = np.isin(log.day, days)
-    return OccupancyLog(
-        log.slot_ids,
-        tuple(log.days[day] for day in days),
-        log.slot[chosen],
-        np.searchsorted(days, log.day[chosen]),
-        log.second[chosen],
-        log.occupied[chosen],
-        log.max_gap_s,
-    )
+    columns = {name: getattr(log, name)[chosen] for name in COLUMNS}
+    columns["day"] = np.searchsorted(days, columns["day"])
+    return replace(log, days=tuple(log.days[day] for day in days), **columns)
 
 
 def summary(log):
@@ -249,7 +234,7 @@ def test_worlds_fitted_to_the_first_days_of_the_real_log_are_like_its_later_days
     log = OccupancyLog.read(REAL_LOG)
     process = fit_process(days_of(log, np.arange(8))).process
     later = days_of(log, 8 + np.flatnonzero(~log.weekend[8:]))
-    worlds = [summary(with_states(later, seen_in_worlds(later, process, seed))) for seed in range(20)]
+    worlds = [summary(replace(later, occupied=seen_in_worlds(later, process, seed))) for seed in range(20)]
     mean, spread, changes = np.mean(worlds, axis=0)
     real_mean, real_spread, real_changes = summary(later)
     assert abs(mean - real_mean) < 0.03

@@ -1,5 +1,6 @@
 import gzip
 import math
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -52,28 +53,22 @@ def test_a_log_is_read(tmp_path, name):
         "2024-01-06 08:00,1,a,rainy,0\n"
     )
     log = OccupancyLog.read(write(tmp_path, text, name))
-    assert log.slot_ids == ("b", "a")
-    assert log.days == ("2024-01-01", "2024-01-06")
+    assert (log.slot_ids, log.days) == (("b", "a"), ("2024-01-01", "2024-01-06"))
     assert [day_class(day) for day in log.days] == ["weekday", "weekend"]
-    assert log.slot.tolist() == [0, 1, 1, 1]
-    assert log.day.tolist() == [0, 0, 0, 1]
+    assert (log.slot.tolist(), log.day.tolist()) == ([0, 1, 1, 1], [0, 0, 0, 1])
     assert log.second.tolist() == [25_200.0, 25_200.0, 27_030.0, 28_800.0]
     assert log.occupied.tolist() == [True, False, True, False]
     assert log.recorded.tolist() == [[True, False], [True, True]]
 
 
 def test_several_logs_are_one_by_date(tmp_path):
-    later = write(
-        tmp_path, HEADER + "2024-01-02 07:00,1,a,sunny,0\n2024-01-02 07:00,1,b,sunny,1\n", "later.csv"
-    )
-    first = write(
-        tmp_path, HEADER + "2024-01-01 08:00,1,b,sunny,0\n2024-01-01 09:00,1,a,sunny,1\n", "first.csv"
-    )
+    text = "2024-01-02 07:00,1,a,sunny,0\n2024-01-02 07:00,1,b,sunny,1\n"
+    later = write(tmp_path, HEADER + text, "later.csv")
+    text = "2024-01-01 08:00,1,b,sunny,0\n2024-01-01 09:00,1,a,sunny,1\n"
+    first = write(tmp_path, HEADER + text, "first.csv")
     log = OccupancyLog.read_all([later, first])
-    assert log.slot_ids == ("a", "b")
-    assert log.days == ("2024-01-01", "2024-01-02")
-    assert log.day.tolist() == [0, 0, 1, 1]
-    assert log.slot.tolist() == [0, 1, 0, 1]
+    assert (log.slot_ids, log.days) == (("a", "b"), ("2024-01-01", "2024-01-02"))
+    assert (log.day.tolist(), log.slot.tolist()) == ([0, 0, 1, 1], [0, 1, 0, 1])
     assert log.occupied.tolist() == [True, False, False, True]
     with pytest.raises(InputError, match=r"first.csv: 2024-01-01 is also in .*first.csv, want different"):
         OccupancyLog.read_all([first, first])
@@ -147,7 +142,7 @@ def test_a_bad_log_object_is_refused(fields, message):
         "slot": [0],
         "day": [0],
         "second": [1.0],
-        "occupied": [True],
+        "occupied": [1],
     }
     with pytest.raises(InputError, match=message):
         OccupancyLog(**(good | fields))
@@ -156,15 +151,8 @@ def test_a_bad_log_object_is_refused(fields, message):
 def replay_of(seconds, states, max_gap_s=7200.0):
     n = len(seconds)
     # The forecast comes from the other Monday.
-    log = OccupancyLog(
-        ("a",),
-        MONDAYS[:2],
-        np.zeros(n + 2, int),
-        np.array([0] * n + [1] * 2),
-        np.array([*seconds, 0.0, 60.0]),
-        np.array([*states, 0, 1], bool),
-        max_gap_s,
-    )
+    days, seconds, states = [0] * n + [1] * 2, [*seconds, 0.0, 60.0], [*states, 0, 1]
+    log = OccupancyLog(("a",), MONDAYS[:2], np.zeros(n + 2, int), days, seconds, states, max_gap_s)
     return RecordedOccupancy(log, np.zeros(1)).world(0, at(MONDAYS[0], 0))
 
 
@@ -231,9 +219,7 @@ def test_the_fullest_log_slots_stand_nearest_to_the_goal():
 def test_a_day_on_which_a_slot_was_not_seen_is_passed_over():
     log = random_log(n_slots=2, days=MONDAYS)
     seen = ~((log.slot == 1) & (log.day == 0))
-    log = OccupancyLog(
-        log.slot_ids, log.days, log.slot[seen], log.day[seen], log.second[seen], log.occupied[seen]
-    )
+    log = replace(log, **{name: getattr(log, name)[seen] for name in ("slot", "day", "second", "occupied")})
     mapped = RecordedOccupancy(log, np.zeros(2)).mapped_log(MONDAYS[0])
     assert sorted(mapped.record.tolist()) == [0, 1 * 2 + 1]
     assert mapped.held_out == {0, 1}

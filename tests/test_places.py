@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -21,9 +22,8 @@ from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.training.spec import TrainingSpec
 from parkenv.studies.training.training import Training, episode_times
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.occupancy.real_week import real_week_occupancy
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR
-from parkenv.world.occupancy.typical_week import typical_occupancy
+from parkenv.world.occupancy.typical_week import real_week_occupancy, typical_occupancy
 from planners.model_file import ModelCard
 
 
@@ -106,10 +106,9 @@ def test_a_lot_without_goal_or_entry_says_how_to_give_them(folder, kind):
         (["mini", "none.geojson"], r"none\.geojson: lot\.file is 'none\.geojson', want a file; there"),
     ],
 )
-@pytest.mark.parametrize("vectorization", ["sync", "vector_entry_point"])
-def test_what_is_no_scenario_is_refused_in_a_line(source, message, vectorization):
+def test_what_is_no_scenario_is_refused_in_a_line(source, message):
     with pytest.raises(InputError, match=message) as caught:
-        gym.make_vec("parkenv/Search-v2", 2, vectorization_mode=vectorization, scenario=source)
+        make_scenarios(source)
     assert "\n" not in str(caught.value)
 
 
@@ -131,11 +130,11 @@ def places_of(env, seed, n=12, act=None):
     names = []
     for episode in range(n):
         _, info = env.reset(seed=seed if episode == 0 else None)
-        names.append(info["place"])
-        assert env.unwrapped.scenario.name == info["place"]
+        names.append(info["scenario"])
+        assert env.unwrapped.scenario.name == info["scenario"]
         if act is not None:
             *_, info = env.step(act)
-            assert info["place"] == names[-1]
+            assert info["scenario"] == names[-1]
     return names
 
 
@@ -153,14 +152,10 @@ def test_a_seed_decides_the_places_whatever_was_done_before():
 
 def test_an_episode_is_that_of_its_place_alone():
     """Same world, rewards and observations, except for the padding."""
-    places = [
-        *PLACES[:4],
-        make_scenario("mini", sensor_model=SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2)),
-    ]
-    env = gym.make("parkenv/Search-v2", scenario=places, max_episode_steps=40)
-    envs = {
-        place.name: gym.make("parkenv/Search-v2", scenario=place, max_episode_steps=40) for place in places
-    }
+    noisy = make_scenario("mini", sensor_model=SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2))
+    make = partial(gym.make, "parkenv/Search-v2", max_episode_steps=40)
+    env = make(scenario=[*PLACES[:4], noisy])
+    envs = {place.name: make(scenario=place) for place in (*PLACES[:4], noisy)}
     met = set()
     rng = np.random.default_rng(0)
     for seed in range(9):
@@ -168,7 +163,7 @@ def test_an_episode_is_that_of_its_place_alone():
         scenario = env.unwrapped.scenario
         alone = envs[scenario.name]
         expected, _ = alone.reset(seed=seed)
-        met.add(info["place"])
+        met.add(info["scenario"])
         ended, n = False, scenario.lot.n_slots
         while not ended:
             assert env.observation_space.contains(observation)
@@ -223,36 +218,36 @@ def test_states_and_pickles_keep_the_place():
 def test_a_batch_draws_a_place_at_each_automatic_reset():
     envs = ParkSearchVectorEnv(5, PLACES, observation="local", max_episode_steps=8, autoreset_mode="SameStep")
     _, info = envs.reset(seed=20)
-    assert info["_place"].all()
+    assert info["_scenario"].all()
     episode = np.zeros(5, dtype=int)
     rng = np.random.default_rng(0)
     for _ in range(60):
-        names = [PLACES[i].name for i in envs.place_of]
-        assert envs.place_of.tolist() == [
+        names = [PLACES[i].name for i in envs.scenario_index]
+        assert envs.scenario_index.tolist() == [
             scenario_of_episode(20 + i, int(e), 6) for i, e in enumerate(episode)
         ]
         observation, _, terminated, truncated, info = envs.step(rng.integers(0, 5, 5))
         assert envs.observation_space.contains(observation)
         done = terminated | truncated
         for i in np.flatnonzero(done):
-            assert info["final_info"]["place"][i] == names[i], "that of the episode that has ended"
+            assert info["final_info"]["scenario"][i] == names[i], "that of the episode that has ended"
         episode += done
     assert episode.min() >= 6
 
 
 def test_a_batch_can_be_kept_to_the_first_places():
     envs = ParkSearchVectorEnv(32, PLACES, observation="local", max_episode_steps=3)
-    envs.n_places = 2
+    envs.n_scenarios = 2
     envs.reset(seed=0)
-    assert set(envs.place_of) == {0, 1}
-    envs.n_places = 6
-    assert set(envs.place_of) == {0, 1}, "from the next episodes on"
+    assert set(envs.scenario_index) == {0, 1}
+    envs.n_scenarios = 6
+    assert set(envs.scenario_index) == {0, 1}, "from the next episodes on"
     for _ in range(4):
         envs.step(np.zeros(32, dtype=int))
-    assert len(set(envs.place_of)) > 4
+    assert len(set(envs.scenario_index)) > 4
     for wrong in (0, 7, 1.5):
-        with pytest.raises(InputError, match="n_places is"):
-            envs.n_places = wrong
+        with pytest.raises(InputError, match="n_scenarios is"):
+            envs.n_scenarios = wrong
 
 
 def test_tiny_lots_with_equal_tables_keep_their_own_forecasts():
@@ -262,7 +257,7 @@ def test_tiny_lots_with_equal_tables_keep_their_own_forecasts():
     envs = ParkSearchVectorEnv(40, places)
     observation, _ = envs.reset(seed=0)
     full = observation["p_occupied"].mean(axis=1)
-    assert full[envs.place_of == 0].min() > full[envs.place_of == 1].max()
+    assert full[envs.scenario_index == 0].min() > full[envs.scenario_index == 1].max()
 
 
 def test_the_split_is_by_lot_and_stable():
@@ -297,17 +292,17 @@ def test_a_curriculum_opens_places_by_size():
     assert open_scenarios(1, 0.0) == open_scenarios(3, 0.0) == 1
 
 
-def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
+def test_a_training_evaluates_on_scenarios_it_never_met(tmp_path, monkeypatch):
     make_small(monkeypatch)
     met = []
     training = search_training("ppo", 2_048, 1_024, PLACES[:4], PLACES[4:], episodes=12, curriculum="size")
-    before = Training.open_places
+    before = Training.open_scenarios
 
     def watched(self, env, steps):
         before(self, env, steps)
-        met.append((steps, env.batch.n_places))
+        met.append((steps, env.batch.n_scenarios))
 
-    monkeypatch.setattr(Training, "open_places", watched)
+    monkeypatch.setattr(Training, "open_scenarios", watched)
     curve = training.train(0, tmp_path)
     assert met == [(steps, open_scenarios(4, steps / 2_048)) for steps in (0, 0, 512, 1024, 1536)]
     assert [n for _, n in met] == [1, 1, 3, 4, 4]
@@ -315,8 +310,7 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
     assert card.scenarios == ("lot0", "lot1", "lot2", "lot3")
     assert card.held_out == ("lot4", "lot5")
     assert card.settings["curriculum"] == "size"
-    row = curve[-1]
-    assert {"total_s", "held_out_s", "held_out_parked_fraction"} < set(row)
+    assert {"total_s", "held_out_s", "held_out_parked_fraction"} < set(curve[-1])
     best = min(curve, key=lambda row: row["total_s"])
     assert card.results["held_out_s"] == best["held_out_s"], (
         "the places trained on decide which model is kept"

@@ -206,7 +206,7 @@ def test_in_a_town_the_way_to_the_goal_takes_no_patience():
     fleet = Fleet(town, demand, background="none", drivers=[DriverKind(policy=POLICIES["greedy-goal"])])
     driven(fleet, 1)
     for car in fleet.cars:
-        problem = fleet.scenarios[car["place"]]
+        problem = fleet.scenarios[car["scenario_index"]]
         way_s = drive_times(problem, int(car["entry"]))[problem.walk_s.argmin()]
         assert car["patience_s"] == pytest.approx(1.0 + way_s)
         assert car["slot"] >= 0 or car["ended_at"] - car["arrival"] >= car["patience_s"]

@@ -13,8 +13,8 @@ from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 from parkenv.lots import grid_lot, packaged_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.world.occupancy.real_week import real_week_occupancy
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, LEVELS, OCCUPIED
+from parkenv.world.occupancy.typical_week import real_week_occupancy
 
 GERMAN = Path(__file__).parents[2] / "shared" / "data" / "german_car_parks" / "hourly_2023_2024.csv.gz"
 

@@ -16,7 +16,7 @@ from parkenv.mapping.store import MapStore, Session
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 from parkenv.studies.study import schemas
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.occupancy.constant_map import FlatMap
+from parkenv.world.occupancy.constant_map import ConstantForecast
 from parkenv.world.occupancy.day_error import DayError, nearness
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.recorded import RecordedOccupancy
@@ -81,7 +81,7 @@ def test_days_of_scenarios_can_be_changed():
     spec = scenario_spec("jam")
     assert changed_by(ScenarioSpec, {"--day-error": "0"}, spec).occupancy.day_error.level == 0.0
     changed = changed_by(ScenarioSpec, {"--day-error": "0.5,0.25"}, spec)
-    assert changed.occupancy.day_error.tables() == {"level": 0.5, "slope": 0.25}
+    assert changed.occupancy.day_error == DayError(0.5, 0.25)
     assert changed.occupancy.event == spec.occupancy.event
     for text in ("x", "1,2,3", "nan", "-1"):
         with pytest.raises(InputError, match=r"^--day-error is "):
@@ -110,7 +110,7 @@ def test_a_file_says_it_all(tmp_path):
     assert made.name == "mine"
     assert made.lot.goals.tolist() == [[3.0, 20.0]]
     assert made.occupancy.n_slots == made.lot.n_slots == 12, "rates of 15 slots, mapped to 12"
-    assert isinstance(made.prior, FlatMap)
+    assert isinstance(made.prior, ConstantForecast)
     assert set(made.forecast(TUESDAY_NOON).p_occupied) == {0.25}
     assert made.arrival.weekdays == (5, 6)
     assert made.arrival.end_s == 11.5 * 3600

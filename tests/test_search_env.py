@@ -5,7 +5,6 @@ import hashlib
 import pickle
 import subprocess
 import sys
-import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -13,11 +12,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_lots import CAR_PARKS
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
-from parkenv.engine.kernel import STEP_RESULT, step_exact_at
+from parkenv.engine.kernel import STEP_RESULT, read_step, step_exact_at
 from parkenv.lots import grid_lot
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
@@ -51,21 +49,15 @@ def digest(env, seed):
 
 
 # Gymnasium's checker takes many steps, and sensors are slow.
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("scenario", "env_id"),
-    [
-        (scenario, env_id)
-        for scenario in CAR_PARKS
-        for env_id in ENV_IDS
-        if scenario == "mini" or (scenario == "street" and env_id == "parkenv/Search-v2")
-    ],
+    [("street", "parkenv/Search-v2"), *(("mini", env_id) for env_id in ENV_IDS)],
 )
 def test_every_id_passes_the_checker_without_a_warning(env_id, scenario):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gym.make(env_id, scenario=scenario, render_mode="rgb_array")
-        check_env(env.unwrapped)
-        env.close()
+    env = gym.make(env_id, scenario=scenario, render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.close()
 
 
 @pytest.mark.filterwarnings("ignore:Your observation (image|scan|pose).* has an unconventional shape")
@@ -135,6 +127,10 @@ def test_a_step_returns_the_numbers_in_the_order_of_their_names():
         terms = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
         assert [result[name] for name in REWARD_TERMS] == [-record[f"step_{name}"] for name in terms]
         assert result["total_s"] == pytest.approx(sum(record[name] for name in terms))
+        read = read_step("mini", tuple(result.values()))
+        assert read[3]["reward_terms"] == {name: result[name] for name in REWARD_TERMS}
+        assert read[3] == {**read[3], **{name: result[name] for name in METRICS}, "scenario": "mini"}
+        assert list(read[3]) == ["reward_terms", *METRICS, "scenario"]
 
 
 @pytest.mark.parametrize("scenario", ["street", "mini"])
@@ -187,14 +183,11 @@ def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
     scenario = two_slots([True, True]).replace(give_up_s=300.0, sensor_model=SensorModel(view_range=0.0))
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     observation, _ = env.reset(seed=0)
-    seen_before_the_end = set()
-    for _ in range(20):
+    seen_before_the_end, terminated = set(), False
+    while not terminated:
+        seen_before_the_end.add(int(observation["vertex"]))
         column = int(np.flatnonzero(scenario.lot.neighbors[observation["vertex"]] >= 0)[-1])
         observation, _, terminated, truncated, info = env.step(column)
-        if terminated:
-            break
-        seen_before_the_end.add(int(observation["vertex"]))
-    assert terminated
     assert not truncated
     assert info["reward_terms"]["gave_up"] == -300.0
     assert not info["parked"]
@@ -344,7 +337,6 @@ def test_sight_differs_by_distance_and_side():
         ({"goal": 9}, "goal is 9"),
         ({"entry": -1}, "entry"),
         ({"sensor_model": 3}, "SensorModel"),
-        ({"scenario": "moon"}, "unknown scenario 'moon', and no such file; known: campus"),
         ({"render_mode": "hologram"}, "render_mode"),
     ],
 )
@@ -357,10 +349,6 @@ def test_wrong_options_are_refused_by_name(changes, message):
 
 def test_wrong_use_is_refused():
     env = gym.make("parkenv/Search-v2", scenario="mini").unwrapped
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(0)
-    with pytest.raises(InputError, match="option of reset is 'speed'"):
-        env.reset(options={"speed": 3})
     env.reset(seed=0)
     for wrong in (7, -1, 3.0, None, [1, 2]):
         with pytest.raises(InputError, match="action is"):

@@ -36,9 +36,9 @@ def test_files_bring_back_what_was_written(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "want a sighting model"),
+        (None, "want a sensor model"),
         ("{", "not JSON"),
-        ("[]", "want a sighting model, a JSON object"),
+        ("[]", "want a sensor model, a JSON object"),
         ('{"format": "parkenv-sensor-model", "version": 7}', "version is 7, want 1"),
         ('{"format": "parkenv-sensor-model", "version": 1, "bands": []}', "view_range"),
         (

@@ -16,8 +16,8 @@ from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.lots import packaged_lot
-from parkenv.scenarios.blind import blind_scenario
 from parkenv.scenarios.calibration import Calibration
+from parkenv.scenarios.selection import blind_scenario
 from parkenv.studies.simulate import Observer
 from parkenv.studies.trips.calibration import calibrate
 from parkenv.studies.trips.calibration_study import OBSERVED, UNOBSERVED
@@ -417,7 +417,7 @@ def test_bad_input_is_one_clear_error():
         searched("mini").run(-1)
     with pytest.raises(InputError, match=r"seed is 1\.5"):
         searched("mini").run(1.5)
-    with pytest.raises(InputError, match="calibration v_drive is 0"):
+    with pytest.raises(InputError, match="v_drive is 0"):
         Calibration("mini", 0, 5.0, 10.0, 3, 2.7)
 
 

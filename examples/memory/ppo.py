@@ -21,7 +21,7 @@ from torch.distributions import Categorical
 
 import parkenv
 from parkenv.engine.spaces import FlatLayout
-from parkenv.world.occupancy.constant_map import FlatMap
+from parkenv.world.occupancy.constant_map import ConstantForecast
 
 ENVS, STEPS, EPOCHS, PARTS = 64, 16, 4, 2
 GAMMA, LAMBDA, CLIP, ENTROPY, LEARNING_RATE = 0.999, 0.95, 0.2, 0.01, 2e-3
@@ -69,7 +69,7 @@ def make_batch(observation, scenario, n):
     """Return n searches in a compiled batch; `no-map` is the belief of a driver whose map says 1/2 for every slot."""
     world = parkenv.make_scenario(scenario)
     if observation == "no-map":
-        world = world.replace(prior=FlatMap(0.5, world.occupancy))
+        world = world.replace(prior=ConstantForecast(0.5, world.occupancy))
     return gym.make_vec(
         "parkenv/Search-v2", n, "vector_entry_point", scenario=world, reward_scale=0.01, max_episode_steps=MAX_STEPS,
         autoreset_mode=AutoresetMode.SAME_STEP,

@@ -7,7 +7,8 @@ observation updates the weights of the hypotheses by Bayes' rule and so changes 
 same update is applied to hypothetical observations while planning: if the car has not parked along a path, the slots
 further on are also more likely to be taken.
 
-A forecast from few days is too sure of single slots, which the posterior over days cannot tell: `DOUBT` allows for it.
+A forecast from few days is too sure of single slots, which the posterior over days cannot tell:
+`UNINFORMATIVE_SLOT_PROBABILITY` allows for it.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ P_TAKEN_AT_EVENT = 0.998
 WORTHLESS = 0.004
 """Probability that the forecast says nothing about the day: then its level is one of `OTHER_LEVELS`, logits."""
 OTHER_LEVELS, OTHER_SLOPES = np.array([-2.0, 0.0, 2.0, 4.0]), np.array([0.0, 2.0, 4.0])
-DOUBT = 0.02
+UNINFORMATIVE_SLOT_PROBABILITY = 0.02
 """Probability that the forecast of a slot says nothing about it: then it is as likely free as taken, on a usual day.
 
 It has the greatest likelihood, of 0 to 0.2, on nine recorded days of 164 slots (CNRPark-EXT), each forecast from the
@@ -73,7 +74,7 @@ class DayBelief:
         rival_rates: (n_slots,) 1/s, rates at which cars beside those of the forecast take each slot while it is free;
             None: there are no such cars.
         hypotheses: about the day: prior weights, (k,), and P(taken) under each, (n_slots, k); None: those above.
-        doubt: probability that the forecast of a slot carries no information (`DOUBT`).
+        doubt: probability that the forecast of a slot carries no information (`UNINFORMATIVE_SLOT_PROBABILITY`).
         event: probability that an event has filled the slots near the goal (`EVENT`). This and `doubt` are without
             effect where the forecast is certain, among rivals, and with hypotheses of the caller.
 
@@ -272,7 +273,6 @@ def _update(
 
 @compiled(inline="always")
 def _weights(log_weight: FloatArray) -> FloatArray:
-    """Return the probabilities of the hypotheses, (k,)."""
     weight: FloatArray = np.exp(log_weight - log_weight.max())
     return np.asarray(weight / weight.sum())
 
@@ -290,12 +290,12 @@ def _decayed(p_taken: FloatArray, leaving: FloatArray, p_then: FloatArray, elaps
 @compiled
 def _mixture(log_weight: FloatArray, p_taken: FloatArray) -> tuple[FloatArray, FloatArray]:
     weight = _weights(log_weight)
-    kept = np.flatnonzero(weight >= NEGLIGIBLE)
-    p_free = np.empty((len(p_taken), len(kept)))
+    likely = np.flatnonzero(weight >= NEGLIGIBLE)
+    p_free = np.empty((len(p_taken), len(likely)))
     for s in range(len(p_taken)):
-        for k in range(len(kept)):
-            p_free[s, k] = 1.0 - p_taken[s, kept[k]]
-    weight = weight[kept]
+        for k in range(len(likely)):
+            p_free[s, k] = 1.0 - p_taken[s, likely[k]]
+    weight = weight[likely]
     return weight / weight.sum(), p_free
 
 

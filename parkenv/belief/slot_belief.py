@@ -136,26 +136,22 @@ class SlotBelief:
     @property
     def forecast(self) -> NDArray[np.floating]:
         """(n_slots,) float, P(taken) before any observation."""
-        row: NDArray[np.floating] = self._rows[0]
-        return row
+        return self._rows[0]  # type: ignore[no-any-return]
 
     @property
     def decay_rate(self) -> NDArray[np.floating]:
         """(n_slots,) float, 1/s, how fast an observation loses its value."""
-        row: NDArray[np.floating] = self._rows[1]
-        return row
+        return self._rows[1]  # type: ignore[no-any-return]
 
     @property
     def p_observed(self) -> NDArray[np.floating]:
         """(n_slots,) float, P(taken) right after the slot's last observation; the forecast if there was none."""
-        row: NDArray[np.floating] = self._rows[2]
-        return row
+        return self._rows[2]  # type: ignore[no-any-return]
 
     @property
     def observed_at(self) -> NDArray[np.floating]:
         """(n_slots,) float, time of the slot's last observation, s since the search began; -1 if there was none."""
-        row: NDArray[np.floating] = self._rows[3]
-        return row
+        return self._rows[3]  # type: ignore[no-any-return]
 
     @cached_property
     def observations(self) -> Observations:
@@ -180,14 +176,12 @@ class SlotBelief:
         A slot counts as observed free if the observation left P(taken) below the forecast, and as observed taken if
         above. If the forecast is certain, an observation that confirms it counts, too.
         """
-        states: NDArray[np.int8] = _states(self.parts)
-        return states
+        return _states(self.parts)  # type: ignore[no-any-return]
 
     @cached_property
     def recent_state(self) -> NDArray[np.uint8]:
         """(n_slots,) uint8, as `state`, but `UNOBSERVED` where "taken" has decayed to the forecast by now."""
-        states: NDArray[np.uint8] = _recent_states(self.parts, self.p_occupied, self.time)
-        return states
+        return _recent_states(self.parts, self.p_occupied, self.time)  # type: ignore[no-any-return]
 
     @property
     def observed_free(self) -> BoolArray:
@@ -278,14 +272,7 @@ def decay_to_prior(prior: float, rate: float, p_observed: float, elapsed: float)
 
 @compiled(error_model="numpy", forceinline=True)
 def bayes_update(p: float, observed_taken: bool, hit_rate: float, false_alarm_rate: float) -> float:
-    """P(taken) of a slot after one observation (Bayes' rule).
-
-    Args:
-        p: P(taken) before the observation.
-        observed_taken: observed state.
-        hit_rate: P(observed taken | taken).
-        false_alarm_rate: P(observed taken | free).
-    """
+    """P(taken) of a slot after one observation (Bayes' rule)."""
     if_taken = hit_rate if observed_taken else 1.0 - hit_rate
     if_free = false_alarm_rate if observed_taken else 1.0 - false_alarm_rate
     evidence = if_taken * p + if_free * (1.0 - p)

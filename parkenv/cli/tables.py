@@ -167,7 +167,7 @@ def stages(console: Console, unit: str = "") -> Iterator[Callable[[str, int, int
 
 def _show_compiling(progress: Progress, ended: Event) -> None:
     """Show a line, until the event, while processes compile functions."""
-    from parkenv.compiled.activity import compiling_now
+    from parkenv.compiled.code_files import compiling_now
 
     since_s, line = time.time(), progress.add_task("", total=None, visible=False, unit="functions")
     while not ended.wait(0.5):

@@ -49,12 +49,7 @@ def cache_folder() -> Path:
 
 
 class CodeFiles:
-    """The compiled code of one function.
-
-    Args:
-        function: the function, in a file of its module.
-        options: the options that it is compiled with.
-    """
+    """The compiled code of one function, in a file of its module, with its options."""
 
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
         # A set of options, as of fastmath, has another order in each process.
@@ -160,7 +155,6 @@ def _read_own(path: Path) -> bytes:
 
 @functools.cache
 def _warn_of_unsafe_cache(folder: Path) -> None:
-    """Warn once per process that code in the cache is not used."""
     _LOGGER.warning(
         "compiled functions in %s are not read: others can write them; they are compiled again", folder
     )
@@ -195,3 +189,14 @@ def _delete_old_versions(folder: Path) -> None:
                 shutil.rmtree(other)
         except OSError:
             continue  # another process deletes it, too
+
+
+def compiling_now(since_s: float) -> tuple[list[str], int]:
+    """Return the functions that are being compiled, and how many are finished, since a time of `time.time`."""
+    names, n_finished = [], 0
+    for path in cache_folder().glob("*/*"):
+        with suppress(OSError):  # deleted meanwhile
+            if path.stat().st_mtime > since_s:
+                names += [path.stem.rpartition("-")[0].strip("_")] if path.suffix == ".lock" else []
+                n_finished += path.suffix == ".nbc"
+    return names, n_finished

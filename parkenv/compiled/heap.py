@@ -18,15 +18,9 @@ def push(
     item: int,
     ranks: IntArray | None = None,
 ) -> int:
-    """Insert an item into a binary heap; return its new size.
+    """Insert an item into a binary heap of `size` keys and items, lowest key first; return its new size.
 
-    Args:
-        keys: (room,) float64, keys of the items in the heap.
-        items: (room,) int32, the items; the first one has the lowest key.
-        size: how many there are.
-        key: key of the new item.
-        item: the new item.
-        ranks: order of items with equal keys: indexed by item, int64; None: any order.
+    `ranks`, indexed by item, orders items with equal keys; None: any order.
     """
     i = size
     while i > 0:

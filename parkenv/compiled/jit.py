@@ -1,4 +1,13 @@
-"""Compile functions with numba, and keep the code until any of its sources changes."""
+"""Compile functions with numba, and keep the code until any of its sources changes.
+
+Numba offers `njit(cache=True)` with `NUMBA_CACHE_DIR`, or a cache locator, for this. It is not used because its key is
+the file of the function alone: callers would keep running the old code of what they call, variants of one function with
+other options would share a file, two processes would compile the same, and a file that others wrote would be run.
+
+Numba optimises every function with all that it calls and makes machine code of it at once. Here that happens only for
+functions that Python calls (`_Library`): what only compiled code calls would be optimised and made again with each of
+its callers, which takes longer than everything else.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +21,21 @@ from typing import Any, overload
 
 import numba
 import numpy as np
+from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.cpu import CPUTargetOptions
+from numba.core.environment import lookup_environment
 from numba.core.options import TargetOptions
-from numba.core.registry import CPUDispatcher
+from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.sigutils import normalize_signature
+from numba.core.targetconfig import ConfigStack
 from numba.core.types.misc import unliteral
 
 from parkenv.compiled.clock import counted
 from parkenv.compiled.code_files import CodeFiles
-from parkenv.compiled.machine_code import make_code_late
 
 # Numba has this flag for its own parallel loops, and no option for it.
 CPUTargetOptions.noalias = TargetOptions.Mapping("noalias")
-make_code_late()
 
 
 @overload
@@ -71,8 +81,8 @@ def _compiled(
     outer = _Function(function, targetoptions=options)
     outer.inner = _KeptFunction(function, targetoptions=options | {"no_cpython_wrapper": True})
     if Path(function.__code__.co_filename).is_file():
-        for kept in (outer, outer.inner):
-            kept._cache = CodeFiles(function, kept.targetoptions | {"single": single})
+        for dispatcher in (outer, outer.inner):
+            dispatcher._cache = CodeFiles(function, dispatcher.targetoptions | {"single": single})
     return outer
 
 
@@ -133,10 +143,89 @@ class _Function(_KeptFunction):
         return self.inner.get_call_template(tuple(unliteral(kind) for kind in args), values)
 
     def get_overload(self, sig: Any) -> Any:
-        """Return what compiled code calls."""
         return self.inner.get_overload(sig)
 
     @property
     def is_compiling(self) -> Any:
-        """Whether a call by compiled code is a recursion."""
         return self._compiling_counter or self.inner.is_compiling
+
+
+class _Library(JITCodeLibrary):  # type: ignore[misc]
+    """The code of a function for LLVM; machine code from the first time that its address is asked for."""
+
+    _optimized = _made = False
+
+    def _finalize_final_module(self) -> None:
+        if self._object_caching_enabled and self._compiled_object:
+            self._make()  # from a file
+        else:
+            self._finalize_dynamic_globals()
+            self._verify_declare_only_symbols()
+            self._finalized = True
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Tidy up each function lightly; numba does it at full length, and for mere declarations, too."""
+        if _before_callers():
+            super()._optimize_functions(ll_module)
+            return
+        ll_module.data_layout = self.codegen._data_layout
+        passes, builder = self.codegen._function_pass_manager(opt=1)
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
+    def _optimize_final_module(self, at_once: bool = False) -> None:
+        if not self._optimized and (at_once or _before_callers()):
+            super()._optimize_final_module()
+            self._optimized = True
+
+    def _make(self) -> None:
+        super()._finalize_final_module()
+        self._made = True
+        for variable in self._final_module.global_variables:
+            environment = lookup_environment(variable.name)
+            if environment is not None:
+                self.codegen.set_env(variable.name, environment)
+
+    def get_pointer_to_function(self, name: str) -> int:
+        self._ensure_finalized()
+        if not self._made:
+            try:
+                self._final_module.get_function(name)
+            except NameError:
+                return 0
+            self._optimize_final_module(at_once=True)
+            self._make()
+        return int(super().get_pointer_to_function(name))
+
+    def serialize_using_object_code(self) -> tuple[str, str, Any]:
+        self._ensure_finalized()
+        if self._made:
+            state: tuple[str, str, Any] = super().serialize_using_object_code()
+            return state
+        return self.name, "bitcode", self._get_module_for_linking().as_bitcode()
+
+
+def _before_callers() -> bool:
+    """Return whether the function that numba compiles now is optimised before its callers are, as numba does.
+
+    With `fastmath` the order decides to what results are rounded; and numba strikes out counting of references (`_nrt`)
+    best before functions grow.
+    """
+    flags = ConfigStack.top_or_none()
+    return flags is None or bool(flags.fastmath) or flags.nrt
+
+
+def _make_code_late() -> None:
+    codegen = cpu_target.target_context.codegen()
+    set_now = codegen.set_env
+
+    def set_env(name: str, environment: Any) -> None:
+        # What a function without machine code needs from Python is set when it has some.
+        if codegen._engine.is_symbol_defined(name):
+            set_now(name, environment)
+
+    codegen._library_class, codegen.set_env = _Library, set_env
+
+
+_make_code_late()

@@ -21,7 +21,7 @@ ENTRY_STREAM = 2
 OBSERVATION_STREAM = 3
 VIEW_STREAM = 4
 DAY_STREAM = 5
-PLACE_STREAM = 6
+SCENARIO_STREAM = 6
 # Streams of the cars of a fleet, numbered by the car instead of the slot.
 HEADWAY_STREAM = 7
 STAY_STREAM = 8

@@ -50,13 +50,13 @@ def _closure_key(file: Path) -> str:
 
 def _closure(file: Path) -> set[Path]:
     """Return the file and all files that it imports, directly or indirectly, except those of libraries."""
-    found = {file}
+    files = {file}
     waiting = [file]
     while waiting:
-        new = _imported_files(waiting.pop()) - found
-        found |= new
+        new = _imported_files(waiting.pop()) - files
+        files |= new
         waiting += new
-    return found
+    return files
 
 
 @functools.cache

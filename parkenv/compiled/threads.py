@@ -17,11 +17,8 @@ Result = TypeVar("Result")
 def in_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Return the result of each item, in their order; on as many cores as numba uses.
 
-    Within `work`, compiled loops and this function itself use one core: the items share the cores among them.
-
-    Args:
-        work: a function that mostly runs compiled code without the interpreter lock.
-        items: its arguments.
+    `work` mostly runs compiled code without the interpreter lock. Within it, compiled loops and this function itself
+    use one core: the items share the cores among them.
     """
     n = get_num_threads()
     if n == 1 or len(items) < 2:

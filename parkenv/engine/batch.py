@@ -17,28 +17,12 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import LINE, int32s, int64s, prefetch, uint8s
 from parkenv.engine.belief_memory import BeliefMemory
-from parkenv.engine.kernel import (
-    arrive,
-    init_prior,
-    observe_live,
-    refresh_belief,
-    step_cost_s,
-    sum_of_costs,
-    take_step,
-    write_belief,
-    write_clock,
-)
+from parkenv.engine.kernel import arrive, init_prior, step_cost_s, sum_of_costs, take_step, write_clock
+from parkenv.engine.live_counts import observe_live
 from parkenv.engine.local_observation import Surroundings, local_space, observe_surroundings
-from parkenv.engine.records import (
-    N_ACTIONS,
-    SEARCH,
-    SENTINEL,
-    ScenarioRecords,
-    Searches,
-    edge_at,
-    scenario_at,
-    search_at,
-)
+from parkenv.engine.records import N_ACTIONS, SEARCH, SENTINEL, edge_at, scenario_at, search_at
+from parkenv.engine.search_belief import refresh_belief, write_belief
+from parkenv.engine.searches import ScenarioRecords, Searches
 from parkenv.engine.spaces import space_of
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, inlined, kernel, prefetch_forecast
 from parkenv.world.scenario import EDGE
@@ -190,7 +174,6 @@ class LocalObserver(Observer):
 
 @kernel
 def first_wrong(actions: IntArray) -> int:
-    """Return the index of the first invalid action, or -1."""
     for e in range(len(actions)):
         if not 0 <= actions[e] < N_ACTIONS:
             return e
@@ -266,7 +249,6 @@ def step_with_surroundings(
     steps: Steps,
     local: NDArray[np.float32],
 ) -> None:
-    """Step, and write the local observation."""
     for e in range(len(actions)):
         _prefetch_searches(address, around, actions, e)
         if idle[e]:
@@ -310,7 +292,6 @@ def _prefetch_searches(address: int, around: Surroundings, actions: IntArray, e:
 
 @inlined
 def _target(search: Any, action: int) -> int:
-    """Return the vertex that an action leads to."""
     edges = scenario_at(search.scenario, 0).edges
     return int(edge_at(edges, search.vertex * N_ACTIONS + action).target)
 
@@ -322,7 +303,7 @@ def _prefetch_vertex(search: Any, around: Surroundings, action: int) -> None:
     target = _target(search, action)
     prefetch(scenario.action_masks + target * N_ACTIONS)
     prefetch(scenario.view_starts + 8 * target)
-    row = around.first[search.place] + target
+    row = around.first[search.scenario_index] + target
     width = 4 * around.numbers.shape[1]
     _prefetch(around.numbers.ctypes.data + row * width, width)
     width = 2 * around.indices.shape[1]
@@ -339,8 +320,8 @@ def _prefetch_lists(search: Any, around: Surroundings, action: int) -> None:
     target = _target(search, action)
     first = int64s(scenario.view_starts)[target]
     _prefetch(scenario.viewed + 8 * first, LINE)
-    _prefetch(around.view_s.ctypes.data + 4 * (around.first_view[search.place] + first), LINE)
-    start = around.starts[around.first[search.place] + target]
+    _prefetch(around.view_s.ctypes.data + 4 * (around.first_view[search.scenario_index] + first), LINE)
+    start = around.starts[around.first[search.scenario_index] + target]
     _prefetch(around.slots.ctypes.data + 4 * start, LINE)
 
 
@@ -348,7 +329,7 @@ def _prefetch_lists(search: Any, around: Surroundings, action: int) -> None:
 def _prefetch_slots(search: Any, around: Surroundings, action: int) -> None:
     """Load what is known of these slots and of the remembered one."""
     scenario = scenario_at(search.scenario, 0)
-    first, remembered = around.first[search.place], search.remembered_slot
+    first, remembered = around.first[search.scenario_index], search.remembered_slot
     prefetch(around.crow_s.ctypes.data + 16 * (first + remembered))
     prefetch(scenario.walk_s + 8 * remembered)
     prefetch(scenario.parking_cost_s + 8 * remembered)
@@ -363,7 +344,6 @@ def _prefetch_slots(search: Any, around: Surroundings, action: int) -> None:
 
 @inlined
 def _prefetch(begin: int, size: int) -> None:
-    """Load the bytes from an address on."""
     for offset in range(0, size, LINE):
         prefetch(begin + offset)
     prefetch(begin + size - 1)

@@ -13,18 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, IntArray
-from parkenv.engine.records import Searches
+from parkenv.engine.searches import Searches
 
 _NEVER = -1
 _MOST_KEPT = 3  # callers rarely hold on to more than the last two
 
 
 class _Beliefs:
-    """Memory of arrays of `Searches`: what callers got of it, and the last step that wrote to it.
-
-    Args:
-        like: arrays by name, for shapes and values.
-    """
+    """Memory of arrays of `Searches`, by name: what callers got of it, and the last step that wrote to it."""
 
     def __init__(self, like: Mapping[str, NDArray[np.float32]]) -> None:
         # No array of numpy's: a view would refer to it instead of the array that the caller got.
@@ -50,11 +46,7 @@ class _Beliefs:
 
 
 class BeliefMemory:
-    """The memory of `p_occupied` and `belief` of some searches.
-
-    Args:
-        searches: the searches, with full belief.
-    """
+    """The memory of `p_occupied` and `belief` of some searches, which keep the full belief."""
 
     def __init__(self, searches: Searches) -> None:
         self._searches = searches
@@ -69,10 +61,9 @@ class BeliefMemory:
         np.copyto(self._begun_in, self._step, where=which)
 
     def renew(self) -> bool:
-        """Let the next step write to memory of which callers hold nothing.
+        """Swap buffers so that arrays returned to callers stay unchanged.
 
-        Returns:
-            whether that is other memory, where the step is to write the belief in all slots that a search knows.
+        Returns whether the next step has other memory, where it is to write the belief in all slots that are known.
         """
         self._now.step = self._step
         self._step += 1
@@ -96,10 +87,10 @@ class BeliefMemory:
 
     def _free(self) -> _Beliefs:
         """Return beliefs of which callers hold nothing, new ones if they hold all."""
-        for kept in self._kept:
-            if kept.are_free():
-                kept.handed_out = []
-                return kept
+        for beliefs in self._kept:
+            if beliefs.are_free():
+                beliefs.handed_out = []
+                return beliefs
         new = _Beliefs(self._now.arrays)
         self._kept = [*self._kept[1 - _MOST_KEPT :], new]
         return new

@@ -41,18 +41,15 @@ from parkenv.engine.kernel import (
     clear_step,
     complete_step,
     drive_or_park,
-    empty_shared_slots,
     enter,
     give_up,
     init_prior,
-    leaves_soon,
     observe,
-    publish_count,
-    refresh_belief,
     sum_of_costs,
     write_clock,
 )
 from parkenv.engine.knowledge import clear_live_map, inform, report_slot, report_view
+from parkenv.engine.live_counts import publish_count
 from parkenv.engine.policy import LEAVE, TAKE_SLOT
 from parkenv.engine.records import (
     BALKED,
@@ -80,6 +77,8 @@ from parkenv.engine.records import (
     shared_slot_at,
     step_at,
 )
+from parkenv.engine.search_belief import refresh_belief
+from parkenv.engine.shared_slots import empty_shared_slots, leaves_soon
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
 from parkenv.world.scenario import EDGE
@@ -320,13 +319,13 @@ def _arrive(fleet: Any) -> int:
     car.target, car.n_moves, car.informed_until = NO_CAR, 0, -np.inf
     fleet.reservations_stale = True
     search = search_at(car.search, 0)
-    search.place, search.car = car.place, number
+    search.scenario_index, search.car = car.scenario_index, number
     search.walks, search.n_forbidden = car.walks, car.n_forbidden
     search.zone_cost_s = fleet.zone_cost_s
     if fleet.zone_cost_s != 0:
         search.zone_cost_s += 8 * fleet.n_zones * number
     car.vertex, car.stands, car.holds = car.entry, False, NO_CAR
-    search.scenario = fleet.scenarios + car.place * SCENARIO_BYTES
+    search.scenario = fleet.scenarios + car.scenario_index * SCENARIO_BYTES
     enter(search, car_key(fleet.key, number), fleet.day, car.arrival, fleet.midnight, car.entry)
     if car.knows == RESERVE_KNOWLEDGE:
         search.reserved = NO_SLOT

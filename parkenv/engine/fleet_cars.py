@@ -81,7 +81,7 @@ class FleetCars:
         if options.tick_s > 0.0:
             ticks = np.ceil((cars["arrival"] - begin) / options.tick_s - 1e-9)
             cars["arrival"] = begin + ticks * options.tick_s
-        cars["entry"], cars["place"] = self._entries[plans.entry], plans.goal
+        cars["entry"], cars["scenario_index"] = self._entries[plans.entry], plans.goal
         cars["stay_s"] = plans.stay_s
         cars["patience_s"] = plans.patience_s + self._way_s[plans.goal, plans.entry]
         shares = np.cumsum([kind.weight for kind in options.drivers])
@@ -130,7 +130,7 @@ class FleetCars:
 
     def arrival_cost_s(self, car: int) -> FloatArray:
         """Return what arriving in each slot costs a car, (n_slots,) s: walk, and parking for its own stay."""
-        problem, walks = self.scenarios[self.records["place"][car]], self.records["walks"][car]
+        problem, walks = self.scenarios[self.records["scenario_index"][car]], self.records["walks"][car]
         # Computed for all cars at once; for one at a time, tariffs take a millisecond each.
         known = self.zone_cost_s
         zone_cost_s = problem.zone_cost_s(self.drivers_of(car)) if known is None else known[car]
@@ -145,7 +145,7 @@ class FleetCars:
             np.zeros((len(self.records), len(lot.zones))) if self.zone_cost_s is None else self.zone_cost_s
         )
         by_walk = np.argsort(self._walk_s, axis=1, kind="stable").astype(np.int64)
-        place, walks = cars["place"].astype(np.int64), cars["walks"].astype(np.float64)
+        place, walks = cars["scenario_index"].astype(np.int64), cars["walks"].astype(np.float64)
         first_counted = lot.n_slots - np.count_nonzero(lot.is_counted)
         of_lot = self._walk_s, by_walk, lot.zone_of_slot, lot.capacity.copy(), int(first_counted)
         _park_at_first(place, walks, u, costs[parked], *of_lot, slots)

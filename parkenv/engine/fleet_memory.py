@@ -12,8 +12,9 @@ from parkenv.compiled.memory import address_of, sparse_zeros
 from parkenv.engine import events, records
 from parkenv.engine.fleet_cars import FleetCars
 from parkenv.engine.fleet_options import TIMES, FleetOptions
-from parkenv.engine.kernel import shared_slots_taken_at
-from parkenv.engine.records import CAR, FLEET, REPORT, SEARCH, STEP, ScenarioRecords, Searches
+from parkenv.engine.records import CAR, FLEET, REPORT, SEARCH, STEP
+from parkenv.engine.searches import ScenarioRecords, Searches
+from parkenv.engine.shared_slots import shared_slots_taken_at
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.kernel import SHARED_KIND
 
@@ -28,7 +29,7 @@ class FleetMemory:
         options: the options of the fleet.
 
     Attributes:
-        scenarios: the scenarios of the cars, one for each goal with a weight; `cars["place"]` are indices into it.
+        scenarios: the scenarios of the cars, one for each goal with a weight; see `cars["scenario_index"]`.
         record: the FLEET record.
         address: its address, for compiled code.
         world: address of the occupancy that the background is drawn from; 0 if Python makes it.

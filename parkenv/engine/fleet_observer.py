@@ -96,7 +96,7 @@ class ObservedFleet(FleetMemory):
     def outcome(self, car: int) -> StepOutcome:
         """Return the result of a car's last step."""
         address = self._search_of(car)
-        scenario = self.scenarios[self.cars["place"][car]]
+        scenario = self.scenarios[self.cars["scenario_index"][car]]
         reward, over, _, info = read_step(scenario.name, step_result_at(address))
         return StepOutcome(bool(self.search_of(address)["n_steps"]), reward, over, info)
 

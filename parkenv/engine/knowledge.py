@@ -13,7 +13,6 @@ import numpy as np
 
 from parkenv.belief.slot_belief import decay_to_prior
 from parkenv.compiled.memory import float64s, int32s, int64s
-from parkenv.engine.kernel import add_observed, column_of, is_taken, set_belief_of
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
@@ -27,6 +26,7 @@ from parkenv.engine.records import (
     search_at,
     slot_at,
 )
+from parkenv.engine.search_belief import add_observed, column_of, is_taken, set_belief_of
 from parkenv.world.occupancy.decay import decay_factor
 from parkenv.world.occupancy.kernel import inlined, kernel
 

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import LINE, float64s, in_one_block, int32s, int64s
-from parkenv.engine.kernel import add_column, column_of, decay_belief, enter, forecast_of, set_belief_of
+from parkenv.engine.kernel import enter
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
@@ -56,13 +56,13 @@ from parkenv.engine.records import (
     P_OBSERVED,
     SENTINEL,
     UNGUIDED,
-    ScenarioRecords,
-    Searches,
     block_at,
     scenario_at,
     search_at,
     slot_at,
 )
+from parkenv.engine.search_belief import add_column, column_of, decay_belief, forecast_of, set_belief_of
+from parkenv.engine.searches import ScenarioRecords, Searches
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES
 from parkenv.world.occupancy.kernel import PROCESS_KIND, inlined, kernel, prefetch_forecast
@@ -115,16 +115,11 @@ class Surroundings(NamedTuple):
 
     @property
     def n_bytes(self) -> int:
-        """Memory, bytes."""
         return sum(array.nbytes for array in self)
 
     @classmethod
     def of(cls, problems: Sequence[SearchProblem], k: int) -> Surroundings:
-        """Compute the surroundings of all vertices.
-
-        Args:
-            problems: define the lots.
-            k: number of slots described, both nearby and ahead of each move.
+        """Compute the surroundings of all vertices, with k slots nearby and k ahead of each move.
 
         Raises:
             InputError: k is not a whole number from 1 to `MAX_SLOTS`.
@@ -157,7 +152,6 @@ def local_space(k: int) -> spaces.Dict:
 
 @kernel
 def observe_surroundings_at(address: int, around: Surroundings, local: NDArray[np.float32]) -> None:
-    """Call `observe_surroundings` for a single search."""
     observe_surroundings(search_at(address, 0), around, local)
 
 
@@ -169,11 +163,7 @@ def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.fl
 
 
 class FollowedSearch:
-    """Computes the local observations of a search from those of `parkenv/Search-v2`, one after the other.
-
-    Args:
-        problems: the lots and goals that a search may have.
-        k: number of slots described.
+    """Local observations, of k slots, of a search from those of `parkenv/Search-v2`, one after the other.
 
     Raises:
         InputError: see `Surroundings.of`.
@@ -185,13 +175,12 @@ class FollowedSearch:
         self._search = Searches(ScenarioRecords(public), 1, full_belief=False)
         self._n_numbers = FIRST_NEAR + PER_NEAR * int(k)
 
-    def begin(self, observation: Mapping[str, Any], place: int = 0) -> dict[str, NDArray[Any]]:
-        """Return the local observation at the beginning of a search for the problem of index `place`."""
-        self._search.begin_outside(place, observation)
+    def begin(self, observation: Mapping[str, Any], scenario: int = 0) -> dict[str, NDArray[Any]]:
+        """Return the local observation at the beginning of a search for the problem of an index."""
+        self._search.begin_outside(scenario, observation)
         return self._follow(observation, True)
 
     def observe(self, observation: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """Return the local observation after a step."""
         return self._follow(observation, False)
 
     def _follow(self, observation: Mapping[str, Any], begins: bool) -> dict[str, NDArray[Any]]:
@@ -239,7 +228,7 @@ def _write_local(search: Any, around: Surroundings, local: NDArray[np.float32]) 
 
     All that it reads is in observations; numbers are rounded as there.
     """
-    lot = search.place
+    lot = search.scenario_index
     if search.n_steps == 0:
         _forecast_regions(search, around, lot)
     _remember(search, around, lot)
@@ -318,7 +307,6 @@ def _p_occupied(search: Any, column: int) -> float:
 
 @inlined
 def _is_observed(search: Any, column: int) -> bool:
-    """Return whether something is known of the slot of a column beyond the forecast."""
     return bool(slot_at(search.slots, column).observed or search.reserved != UNGUIDED)
 
 
@@ -330,7 +318,6 @@ def _arrival_cost_s(scenario: Any, slot: int) -> float:
 
 @inlined
 def _find_columns(search: Any, around: Surroundings, row: int) -> None:
-    """Write the columns of the slots of a row of `around` into `around.columns`."""
     columns, begin = int32s(search.columns), around.starts[row]
     for i in range(around.starts[row + 1] - begin):
         slot = np.int64(around.slots[begin + i])

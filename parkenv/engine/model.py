@@ -20,39 +20,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from parkenv.belief.day_belief import DOUBT, DayBelief
+from parkenv.belief.day_belief import UNINFORMATIVE_SLOT_PROBABILITY, DayBelief
 from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of, call_at
 from parkenv.engine.batch import first_wrong
 from parkenv.engine.kernel import (
-    column_of,
     drive_or_park,
-    end_observed,
     enter,
     finish_step,
     give_up,
-    is_taken,
-    set_belief_of,
     step_cost_s,
     sum_of_costs,
     take_step,
     write_clock,
 )
 from parkenv.engine.policy import CompiledPolicy, car_of
-from parkenv.engine.records import (
-    CAR,
-    FLEET,
-    N_ACTIONS,
-    NO_SLOT,
-    SEARCH,
-    ScenarioRecords,
-    Searches,
-    most_observed_in,
-    scenario_at,
-    search_at,
-    slot_at,
-)
+from parkenv.engine.records import CAR, FLEET, N_ACTIONS, NO_SLOT, SEARCH, scenario_at, search_at, slot_at
+from parkenv.engine.search_belief import column_of, end_observed, is_taken, set_belief_of
+from parkenv.engine.searches import ScenarioRecords, Searches, most_observed_in
 from parkenv.engine.spaces import action_number
 from parkenv.errors import InputError, require_whole
 from parkenv.world.lot import PARK
@@ -137,7 +123,7 @@ class _Days(NamedTuple):
             _cells(error.slope, _SLOPES),
         )
         weight = np.outer(level_p, slope_p).ravel()
-        level, slope = (one.ravel() for one in np.meshgrid(levels, slopes, indexing="ij"))
+        level, slope = (axis.ravel() for axis in np.meshgrid(levels, slopes, indexing="ij"))
         return cls(weight, level, slope, (level_width, slope_width))
 
 
@@ -168,12 +154,10 @@ class Simulations:
 
     @property
     def over(self) -> BoolArray:
-        """Which searches are over, (n,) bool: parked, or gave up in a full lot."""
         over: BoolArray = self.searches.records["over"].copy()
         return over
 
     def observation(self, i: int = 0) -> Observation:
-        """Return what the last step of a search has told."""
         rows, record = self.searches.step_observed[i], self.searches.records[i]
         k = int(record["n_step_observed"])
         slots, taken, *rates = rows[:, :k].astype(np.float64)
@@ -282,10 +266,10 @@ class Model:
             raise InputError(f"observation has {len(seen.p_occupied)} slots, want {n}, those of the lot")
         slots = seen.take(np.arange(n))
         forecast = np.clip(slots.forecast, MIN_PROBABILITY, MAX_PROBABILITY)
-        error = DayError(*(float(one) for one in seen.day_error))
+        error = DayError(*(float(deviation) for deviation in seen.day_error))
         near, days = nearness(self.problem.walk_s), _Days.of(error)
         if self._any_day:
-            day = DayBelief(slots, near, doubt=DOUBT)
+            day = DayBelief(slots, near, doubt=UNINFORMATIVE_SLOT_PROBABILITY)
         else:
             centre = centred_logits(forecast, error.deviations(near))
             logits = centre[:, None] + days.level + near[:, None] * days.slope
@@ -418,7 +402,6 @@ class Model:
         return int(action == PARK and self.problem.action_masks[vertex, PARK] == 1 and len(slots) > 0)
 
     def _require_own(self, of: Belief | Simulations) -> None:
-        """Raise an `InputError` for a belief or a simulation of another model."""
         name = "belief" if isinstance(of, Belief) else "state"
         tables = of._tables if isinstance(of, Belief) else of.searches.scenarios
         lot, other = self.problem.lot, tables.scenarios[0].lot
@@ -465,14 +448,9 @@ def _last_observations(slots: SlotBelief, forecast: FloatArray) -> Observations:
 
 
 class _PolicyBatch:
-    """A car for each of some searches in one scenario, with its memory of the search.
+    """A car for each of some searches in one scenario, whose `moves` are the cars' from now on.
 
-    Args:
-        searches: the searches; their `moves` are the cars' from now on.
-        policy: what drives the cars.
-
-    Attributes:
-        address: address of the FLEET record of the cars.
+    `address` is that of the FLEET record of the cars.
     """
 
     def __init__(self, searches: Searches, policy: CompiledPolicy) -> None:
@@ -512,7 +490,7 @@ def _sample_at(
     """
     for e in range(len(keys)):
         search = search_at(address, e)
-        search.scenario, search.place = search.scenarios, 0
+        search.scenario, search.scenario_index = search.scenarios, 0
         search.n_forbidden = scenario_at(search.scenario, 0).n_forbidden
         enter(search, keys[e], 0, arrival, 0.0, vertex)
         search.day_odds, search.day_slope = day_odds[e], day_slope[e]

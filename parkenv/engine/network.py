@@ -96,21 +96,21 @@ def decide_by_network(address: int, number: int) -> int:
 
 @inlined
 def _surroundings_of(network: Any) -> Surroundings:
-    its = surroundings_at(network.surroundings, 0)
-    n_lots, n = its.n_lots, its.n_vertices
+    around = surroundings_at(network.surroundings, 0)
+    n_lots, n = around.n_lots, around.n_vertices
     # The lengths of flat arrays do not matter to compiled code, but for that of the last.
     return Surroundings(
-        int64_array(its.first, (n_lots,)),
-        float32_array(its.numbers, (n, its.n_numbers)),
-        int16_array(its.indices, (n, its.n_indices)),
-        int32_array(its.targets, (n, N_MOVES)),
-        int32_array(its.starts, (n + 1,)),
-        int32_array(its.slots, (n,)),
-        float64_array(its.crow_s, (n, 2)),
-        int32_array(its.samples, (n_lots, N_REGIONS, SAMPLES)),
-        int64_array(its.first_view, (n_lots,)),
-        float32_array(its.view_s, (n,)),
-        int32_array(its.columns, ((N_MOVES + 1) * its.k,)),
+        int64_array(around.first, (n_lots,)),
+        float32_array(around.numbers, (n, around.n_numbers)),
+        int16_array(around.indices, (n, around.n_indices)),
+        int32_array(around.targets, (n, N_MOVES)),
+        int32_array(around.starts, (n + 1,)),
+        int32_array(around.slots, (n,)),
+        float64_array(around.crow_s, (n, 2)),
+        int32_array(around.samples, (n_lots, N_REGIONS, SAMPLES)),
+        int64_array(around.first_view, (n_lots,)),
+        float32_array(around.view_s, (n,)),
+        int32_array(around.columns, ((N_MOVES + 1) * around.k,)),
     )
 
 
@@ -159,7 +159,6 @@ def _activate(values_at: int, n: int, activation: int) -> None:
 
 @inlined
 def _choose(network: Any, search: Any, logits_at: int) -> int:
-    """Choose the most probable action, or draw one."""
     logits = float32s(logits_at)
     best, highest, total = -1, -np.inf, 0.0
     for action in range(N_ACTIONS):
@@ -228,7 +227,6 @@ class NetworkPolicy(CompiledPolicy):
         )
 
     def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
-        """Return a NETWORK record for a fleet."""
         around = Surroundings.of(problems, self.k)
         arrays = {name: np.ascontiguousarray(array) for name, array in around._asdict().items()}
         numbers = {
@@ -238,13 +236,10 @@ class NetworkPolicy(CompiledPolicy):
             "n_indices": around.indices.shape[1],
             "k": self.k,
         }
-        its, local = (
-            PolicyData(SURROUNDINGS, numbers, arrays),
-            np.zeros(FIRST_NEAR + PER_NEAR * self.k, np.float32),
-        )
-        return PolicyData(
-            NETWORK, self._numbers, {**self._arrays, "surroundings": its.record, "local": local}, its
-        )
+        tables = PolicyData(SURROUNDINGS, numbers, arrays)
+        local = np.zeros(FIRST_NEAR + PER_NEAR * self.k, np.float32)
+        arrays = {**self._arrays, "surroundings": tables.record, "local": local}
+        return PolicyData(NETWORK, self._numbers, arrays, tables)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the network; records hold addresses of this process."""

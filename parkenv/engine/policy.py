@@ -24,7 +24,6 @@ from parkenv.belief.slot_belief import (
 )
 from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, call_address, float64s, int32s, int64s, uint8s
-from parkenv.engine.kernel import belief_now, forecast_of, is_forbidden, parking_cost_s
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
@@ -38,6 +37,7 @@ from parkenv.engine.records import (
     search_at,
     slot_at,
 )
+from parkenv.engine.search_belief import belief_now, forecast_of, is_forbidden, parking_cost_s
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import inlined
 from parkenv.world.scenario import SearchProblem
@@ -49,17 +49,11 @@ TAKE_SLOT = 16
 
 
 class PolicyData:
-    """The data of a compiled policy for one fleet, such as tables or a network.
-
-    Args:
-        dtype: of the record.
-        numbers: fields of the record.
-        arrays: arrays whose addresses are the fields of these names.
-        kept: what arrays point to.
+    """The data of a compiled policy for one fleet, such as tables or a network: a record of numbers and addresses.
 
     Attributes:
         record: (1,) of the dtype.
-        arrays: the arrays.
+        arrays: arrays whose addresses are the fields of these names.
         address: address of the record.
     """
 
@@ -130,7 +124,6 @@ def search_of(address: int) -> Any:
 
 @inlined
 def policy_data(address: int, car: Any) -> int:
-    """Return the address of the `PolicyData` of a car's policy."""
     return int(int64s(fleet_at(address, 0).policy_data)[car.kind])
 
 

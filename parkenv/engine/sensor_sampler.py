@@ -38,27 +38,24 @@ class Station(NamedTuple):
 
 
 def make_rig(rig: str | SensorRig | None, scenario: Scenario, picture_width: int | None = None) -> SensorRig:
-    """Return a rig by name, as it is, or by default the scenario's.
+    """Return a rig by name, as it is, or by default the scenario's; with pictures of another width, px, if given.
 
-    Args:
-        rig: the rig or its name.
-        scenario: defines the default.
-        picture_width: px, width of the pictures; None: `PICTURE_WIDTH` for a rig by name, a `SensorRig`'s own.
+    A rig by name has pictures of `PICTURE_WIDTH`.
     """
     rig = scenario.rig if rig is None else rig
     if isinstance(rig, SensorRig):
-        made, width = rig, picture_width
+        sized, width = rig, picture_width
     elif not isinstance(rig, str):
         raise InputError(f"rig is a {type(rig).__name__}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
     elif rig not in RIG_NAMES:
         raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
     else:
-        made, width = SensorRig.named(rig), PICTURE_WIDTH if picture_width is None else picture_width
-        made = made.mirrored() if scenario.lot.left_hand else made
+        sized, width = SensorRig.named(rig), PICTURE_WIDTH if picture_width is None else picture_width
+        sized = sized.mirrored() if scenario.lot.left_hand else sized
     if width is None:
-        return made
+        return sized
     require_whole("picture_width", width, least=64)
-    return made.resized(int(width))
+    return sized.resized(int(width))
 
 
 class SensorSampler:
@@ -94,27 +91,14 @@ class SensorSampler:
         self._cached_world: tuple[np.uint64, LotScenes, Weather] | None = None
 
     def sample_step(self, state: SearchState, since: tuple[int, float] | None) -> list[TimedCapture]:
-        """Measure along the edge just driven, or at the vertex if the car has not moved.
+        """Measure along the edge just driven, or at the vertex if the car has not moved; the newest capture last.
 
-        Args:
-            state: the current state of the search.
-            since: vertex and time, s, before the last step; None at the start of the search.
-
-        Returns:
-            1 to `captures` captures, the newest last.
+        `since` are vertex and time, s, before the last step; None at the start of the search.
         """
         return self.sample(state, self._stations(state, since))
 
     def sample(self, state: SearchState, stations: Sequence[Station]) -> list[TimedCapture]:
-        """Measure at the given stations.
-
-        Args:
-            state: state of the search, which defines the world.
-            stations: poses and times, oldest first.
-
-        Returns:
-            One capture for each station.
-        """
+        """Measure in the world of a search at the given stations, oldest first; returns one capture for each."""
         scenes, weather = self._world(state)
         jobs = []
         for time, pose, movers in stations:
@@ -130,15 +114,9 @@ class SensorSampler:
         )
 
     def select_stations(self, driven: FloatArray) -> NDArray[np.int64]:
-        """Select evenly spaced points of a driven path, including the last.
+        """Select evenly spaced points of a driven path, at most `captures` and at least `every` m apart, with the last.
 
-        They are at least `every` m apart, and at most `captures`.
-
-        Args:
-            driven: (k,) m, distance driven up to each candidate point, ascending; k at least 1.
-
-        Returns:
-            Indices of 1 to `captures` points, ascending.
+        Returns indices into `driven`, (k,) m up to each candidate point, ascending.
         """
         n = self._captures_on(float(driven[-1] - driven[0]))
         wanted = np.linspace(driven[0], driven[-1], n + 1)[1:-1]
@@ -156,7 +134,6 @@ class SensorSampler:
         return self._cached_world[1:]
 
     def _stations(self, state: SearchState, since: tuple[int, float] | None) -> list[Station]:
-        """Return time and pose of each capture."""
         here = self._lot.vertex_xy[state.vertex]
         stop = Station(state.time, np.array([*here, self._heading(state)]))
         if since is None or since[0] == state.vertex:

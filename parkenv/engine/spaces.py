@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.engine.records import NEVER_OBSERVED, most_observed_in
+from parkenv.engine.records import NEVER_OBSERVED
+from parkenv.engine.searches import most_observed_in
 from parkenv.errors import InputError
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.day_error import MAX_LOGITS
@@ -28,14 +29,13 @@ _FLAT = ("p_occupied", "day_error", "action_mask")
 
 def space_of(scenarios: Sequence[SearchProblem], most_observed: int | None = None) -> spaces.Dict:
     """The observation space that fits the lots of all scenarios; see `Searches` for `most_observed`."""
-    lots = [one.lot for one in scenarios]
+    lots = [scenario.lot for scenario in scenarios]
     n_slots, n_vertices = max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots)
     k = most_observed_in(scenarios) if most_observed is None else most_observed
     return search_space(n_slots, n_vertices, k)
 
 
 def search_space(n_slots: int, n_vertices: int, most_observed: int) -> spaces.Dict:
-    """The observation space for a lot of the given size; see `parkenv.envs.search.SearchEnv`."""
     belief = _box_of_parts([(0.0, 1.0), (0.0, MAX_DECAY_RATE), (0.0, 1.0), (NEVER_OBSERVED, LATEST)], n_slots)
     observed = _box_of_parts([(-1.0, n_slots - 1.0), *[(0.0, 1.0)] * 3], most_observed)
     return spaces.Dict(
@@ -78,11 +78,11 @@ class FlatLayout:
             return
         if "p_occupied" not in space.spaces or "belief" in space.spaces:
             raise InputError("flat is True, want an observation other than full, such as local or occupancy")
-        place: Any = space["vertex"]
-        self._places = np.eye(int(place.n), dtype=np.float32)
+        vertex: Any = space["vertex"]
+        self._vertices = np.eye(int(vertex.n), dtype=np.float32)
         rest = [space[name] for name in _FLAT]
-        low = np.concatenate([np.zeros(place.n + 1), [-1.0, -1.0], *(one.low for one in rest)])  # type: ignore[attr-defined]
-        high = np.concatenate([np.ones(place.n + 3), *(one.high for one in rest)])  # type: ignore[attr-defined]
+        low = np.concatenate([np.zeros(vertex.n + 1), [-1.0, -1.0], *(box.low for box in rest)])  # type: ignore[attr-defined]
+        high = np.concatenate([np.ones(vertex.n + 3), *(box.high for box in rest)])  # type: ignore[attr-defined]
         self.space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
 
     def __call__(self, observation: Mapping[str, Any]) -> NDArray[np.float32]:
@@ -93,12 +93,11 @@ class FlatLayout:
         now, elapsed = np.moveaxis(observation["time"], -1, 0)
         angle = now * (2.0 * np.pi / DAY_S)
         times = np.stack([elapsed / (elapsed + 60.0), np.sin(angle), np.cos(angle)], axis=-1)
-        parts = [self._places[observation["vertex"]], times, *(observation[name] for name in _FLAT)]
+        parts = [self._vertices[observation["vertex"]], times, *(observation[name] for name in _FLAT)]
         return np.concatenate(parts, axis=-1, dtype=np.float32)
 
 
 def _box_of_parts(bounds: Sequence[tuple[float, float]], length: int) -> spaces.Box:
-    """Return the space of consecutive parts of equal length, with the bounds of each."""
     low, high = np.repeat(np.array(bounds, np.float32), length, axis=0).T
     return spaces.Box(low, high, dtype=np.float32)
 

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.engine.kernel import read_belief_at
-from parkenv.engine.records import SEARCH, Searches, arrival_of
+from parkenv.engine.records import SEARCH
+from parkenv.engine.searches import Searches, arrival_of
 from parkenv.world.occupancy.process import Arrival, World
 from parkenv.world.scenario import Scenario
 
 
+def _field(name: str, kind: type) -> Any:
+    """Return a property that reads a field of the SEARCH record."""
+    return property(lambda state: kind(state._record[name]))
+
+
 class SearchState:
     """The current episode of a search, including the hidden occupancy; a live view of the environment.
-
-    Args:
-        searches: the searches of the environment.
-        index: number of the search.
 
     Attributes:
         path: vertices where the car has stopped, in order.
@@ -30,22 +34,18 @@ class SearchState:
 
     @property
     def scenario(self) -> Scenario:
-        """Scenario of the episode."""
         return self._searches.scenario_of(self._index)
 
     def extend_path(self) -> None:
-        """Add the car's vertex to the path if the car has moved."""
         if not self.path or self.path[-1] != self.vertex:
             self.path.append(self.vertex)
 
     @property
     def key(self) -> np.uint64:
-        """Key of the world."""
         return np.uint64(self._record["key"])
 
     @property
     def arrival(self) -> Arrival:
-        """When the search began."""
         return arrival_of(self.scenario, self._record)
 
     @property
@@ -68,46 +68,15 @@ class SearchState:
         return belief
 
     @property
-    def vertex(self) -> int:
-        """Current vertex of the car."""
-        return int(self._record["vertex"])
-
-    @property
-    def time(self) -> float:
-        """Current time, s since Monday 00:00."""
-        return float(self._record["time"])
-
-    @property
-    def walk_s(self) -> float:
-        """Walk to the goal, s; 0 before the car is parked."""
-        return float(self._record["walk_s"])
-
-    @property
-    def parking_cost_s(self) -> float:
-        """Parking cost, s; 0 before the car is parked."""
-        return float(self._record["parking_cost_s"])
-
-    @property
     def total_s(self) -> float:
         """Total time so far, s: the sum of all costs."""
         return float(self._record["costs"].sum())
 
-    @property
-    def driven_m(self) -> float:
-        """Length of the edges driven along, m."""
-        return float(self._record["driven_m"])
-
-    @property
-    def failed_parks(self) -> int:
-        """Number of failed parking attempts."""
-        return int(self._record["failed_parks"])
-
-    @property
-    def parked(self) -> bool:
-        """Whether the car has parked."""
-        return bool(self._record["parked"])
-
-    @property
-    def over(self) -> bool:
-        """Whether the search is over."""
-        return bool(self._record["over"])
+    vertex = _field("vertex", int)
+    time = _field("time", float)  # s since Monday 00:00
+    walk_s = _field("walk_s", float)  # to the goal; 0 before the car is parked
+    parking_cost_s = _field("parking_cost_s", float)
+    driven_m = _field("driven_m", float)
+    failed_parks = _field("failed_parks", int)
+    parked = _field("parked", bool)
+    over = _field("over", bool)

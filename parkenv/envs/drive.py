@@ -21,12 +21,14 @@ from parkenv.driving.parking_task import AREA, KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.scene_files import vehicle_of
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
 from parkenv.driving.yielding_traffic import YieldingTraffic
-from parkenv.envs.drive_goals import goal_error, goal_errors, goal_of
 from parkenv.envs.drive_observation import (
     CORNERS,
     FAR,
     drive_observation_space,
     fill_observation,
+    goal_error,
+    goal_errors,
+    goal_of,
     obstacle_map,
     scan_plane,
 )
@@ -252,7 +254,6 @@ length and width over the car's |
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start a new episode; see the class for seeds and options."""
         given = reset_options(options, ("start",))
         super().reset(seed=seed)
         self._episode = 0 if seed is not None else self._episode + 1
@@ -273,7 +274,6 @@ length and width over the car's |
         return observation, self._info(self._state)
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Apply an action for 0.1 s; see the class."""
         state = self.state
         if state.over or self._closed:
             raise gym.error.ResetNeeded("the episode has ended, or was closed: call reset()")
@@ -339,7 +339,6 @@ length and width over the car's |
         return float(rewards[0]) if np.ndim(achieved_goal) == 1 else rewards.astype(np.float32)
 
     def render(self) -> Any:
-        """Return a frame, or update the window, depending on `render_mode`."""
         if self.render_mode is None:
             gym.logger.warn(
                 'render() does nothing without a render_mode, e.g. gym.make(..., render_mode="rgb_array")'
@@ -356,7 +355,6 @@ length and width over the car's |
         return frame
 
     def get_keys_to_action(self) -> dict[tuple[int, ...], NDArray[np.float32]]:
-        """Keys for `gymnasium.utils.play`: w and s accelerate forward and backward, a and d steer left and right."""
         along, aside = {"": 0.0, "w": 1.0, "s": -1.0}, {"": 0.0, "a": 1.0, "d": -1.0}
         return {
             tuple(sorted(map(ord, go + turn))): np.array([force, angle], dtype=np.float32)
@@ -366,7 +364,6 @@ length and width over the car's |
         }
 
     def close(self) -> None:
-        """Close the window, if open, and end the episode."""
         self._closed = True
         if self._renderer is not None:
             self._renderer.window.close()

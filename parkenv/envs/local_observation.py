@@ -45,13 +45,11 @@ class LocalObservation(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; as the environment, but with the local observation."""
         observation, info = self.env.reset(seed=seed, options=options)
         scenarios, scenario = self.get_wrapper_attr("scenarios"), self.get_wrapper_attr("scenario")
-        place = next(i for i, one in enumerate(scenarios) if one is scenario)
-        return self._followed.begin(observation, place), info
+        index = next(i for i, other in enumerate(scenarios) if other is scenario)
+        return self._followed.begin(observation, index), info
 
     def step(self, action: np.int64) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
-        """Act; as the environment, but with the local observation."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._followed.observe(observation), reward, terminated, truncated, info

@@ -60,7 +60,6 @@ class OnboardPerception:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the results of the last step."""
         self.results: tuple[PerceptionResult, ...] = ()
         self.observation = SlotObservation.none()
 
@@ -167,7 +166,6 @@ class SearchPerceptionEnv(SensingSearchEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; see the class."""
         self.perception.reset()
         return super().reset(seed=seed, options=options)
 

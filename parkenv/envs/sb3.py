@@ -47,7 +47,6 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self._masks: NDArray[Any] = np.zeros((self.num_envs, 0), dtype=np.int8)
 
     def reset(self) -> dict[str, NDArray[Any]]:
-        """Start all episodes, with the seeds of `seed` or with the next ones."""
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observations, _ = self.batch.reset(seed=seeds)
         self._reset_seeds()
@@ -58,13 +57,11 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return dict(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Set the actions of the next `step_wait`."""
         self.actions = np.asarray(actions)
 
     def step_wait(
         self,
     ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Step all environments; see the class for `info`."""
         observations, rewards, terminated, truncated, info = self.batch.step(self.actions)
         self._masks = observations.get("action_mask", self._masks)
         self._returns += rewards
@@ -104,7 +101,6 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         """Do nothing: there are no resources to release."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the adapter, else of the batch, for each environment; the render mode is None."""
         value = None if attr_name == "render_mode" else getattr(self._owner(attr_name), attr_name)
         return [value for _ in self._get_indices(indices)]
 
@@ -128,7 +124,6 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return self if hasattr(self, name) else self.batch
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return True for `Monitor`: the batch has its function built in."""
         from stable_baselines3.common.monitor import Monitor
 
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
@@ -140,7 +135,7 @@ class SearchVecEnv(BatchVecEnv):
     Args:
         num_envs: number of searches.
         scenario: a scenario, its name, a file, a folder of files, or a sequence of these; if there are several, one is
-            drawn for each episode, and `info["place"]` names it at the end.
+            drawn for each episode, and `info["scenario"]` names it at the end.
         reward_scale: factor of the rewards in seconds; returns near one are easiest to learn.
         k: number of slots in the `local` observation, 5 if None.
         observation: `local`; for a single lot also `full`.

@@ -88,7 +88,6 @@ class ScanObservation(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode, without the scans of the one before."""
         self._scans.clear()
         return super().reset(seed=seed, options=options)
 

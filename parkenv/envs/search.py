@@ -26,9 +26,8 @@ from parkenv.engine.local_observation import (
     local_space,
     observe_surroundings_at,
 )
-from parkenv.engine.records import ScenarioRecords, Searches
+from parkenv.engine.searches import START_OPTIONS, ScenarioRecords, Searches, choose_start
 from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout, action_number, space_of
-from parkenv.engine.starts import START_OPTIONS, choose_start
 from parkenv.engine.state import SearchState
 from parkenv.errors import InputError, require_number, require_one_of, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
 
 _REBUILT = {
-    "searches", "scenario", "_state", "_address", "_copiers", "_place", "_step", "_copy_mask", "_copy_masks",
+    "searches", "scenario", "_state", "_address", "_copiers", "_scenario_index", "_step", "_copy_mask", "_copy_masks",
     "_seeded_with", "_begun", "_over",
 }  # fmt: skip
 
@@ -124,9 +123,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     `reset(seed=s)` fixes arrival, entry and the state of every slot at every time, whatever the agent does; later
     `reset()` calls continue with further worlds of the same seed.
 
-    `reset(options={"entry": 1, "arrival": "Tue 08:30", "place": "street"})`, or some of them, choose where and when
+    `reset(options={"entry": 1, "arrival": "Tue 08:30", "scenario": "street"})`, or some of them, choose where and when
     this episode begins: the entry by its index; the arrival as a time of the week, s since Monday 00:00 or a text, on a
-    weekday of the scenario's; the place by name or index, where there are several scenarios. The rest is drawn.
+    weekday of the scenario's; the scenario by name or index, where there are several. The rest is drawn.
 
     ## Episode end
     - Terminated: parked; or the lot is *proven full*: every slot was observed in this search, and taken when last
@@ -139,17 +138,17 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     walked_m, failed_parks, slots_passed (slots whose vertex the car stopped at) and parked. The step count of a
     time-limit wrapper is not part of `get_state`.
 
-    ## Places
+    ## Several scenarios
     With several scenarios, each episode is in one of them, drawn from the seed and the number of the episode: the same
-    seed gives the same places, whatever the agent does. `info["place"]` names the scenario after each reset and step,
-    and `env.unwrapped.scenario` is it. The observation space fits the largest lot: in smaller ones, slots past the last
+    seed gives the same ones, whatever the agent does. `info["scenario"]` names it after each reset and step, and
+    `env.unwrapped.scenario` is it. The observation space fits the largest lot: in smaller ones, slots past the last
     are taken (1) and never observed. `observation="local"` has the same size on every lot.
 
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
     >>> env = gym.make("parkenv/Search-v2", scenario=["campus", "street", "mini"], observation="local")
-    >>> [env.reset(seed=seed)[1]["place"] for seed in range(5)]
+    >>> [env.reset(seed=seed)[1]["scenario"] for seed in range(5)]
     ['mini', 'campus', 'street', 'campus', 'campus']
 
     ```
@@ -223,7 +222,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._around: Surroundings | None = None
         if observation == "occupancy":
             self.observation_space = spaces.Dict(
-                {name: one for name, one in self.observation_space.items() if name not in BELIEF_PARTS}
+                {name: box for name, box in self.observation_space.items() if name not in BELIEF_PARTS}
             )
         elif observation == "local":
             k = NEAR_SLOTS if k is None else k
@@ -234,7 +233,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self.observation_space = self._flat.space  # type: ignore[assignment]
             self._is_full = False
         self.reward_scale = float(reward_scale)
-        self._vertices = list(np.arange(max(one.lot.n_vertices for one in self.scenarios)))
+        self._vertices = list(np.arange(max(scenario.lot.n_vertices for scenario in self.scenarios)))
         self._renderer: SearchRenderer | None = None
         self._make_search()
 
@@ -243,20 +242,19 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._address, self._needs_python = self.searches.address, self.searches.needs_python
         self._state = SearchState(self.searches)
         self._copiers = self.searches.copiers(0)
-        self._copy_masks = [[mask.copy for mask in one.action_masks] for one in self.scenarios]
-        self._place = -1
-        self._enter_place()
+        self._copy_masks = [[mask.copy for mask in scenario.action_masks] for scenario in self.scenarios]
+        self._scenario_index = -1
+        self._enter_scenario()
         self._seeded_with: int | None = None
         self._begun, self._over = False, True
 
-    def _enter_place(self) -> None:
-        """Take the scenario of the episode."""
-        place = int(self.searches.records["place"][0])
-        if place == self._place:
+    def _enter_scenario(self) -> None:
+        index = int(self.searches.records["scenario_index"][0])
+        if index == self._scenario_index:
             return
-        self._place, self.scenario = place, self.scenarios[place]
+        self._scenario_index, self.scenario = index, self.scenarios[index]
         self._name, self._is_exact = self.scenario.name, self.scenario.observes_exactly
-        self._copy_mask = self._copy_masks[place]
+        self._copy_mask = self._copy_masks[index]
         self._close_window()
 
     @property
@@ -281,7 +279,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         """
         self.searches.restore(state.arrays)
         self._state.path = list(state.path)
-        self._enter_place()
+        self._enter_scenario()
         self._step = self._stepper()
         self._begun, self._over = True, self._state.over
 
@@ -299,7 +297,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; see the class for seeds and options."""
         starts = reset_options(options, START_OPTIONS)
         super().reset(seed=seed)
         if self.np_random_seed < 0:
@@ -316,16 +313,15 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if self.searches.needs_python:
             self.searches.complete_arrival(0)
             init_external_forecast_at(self._address)
-        self._enter_place()
+        self._enter_scenario()
         self._step = self._stepper()
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
             self.render()
-        return self._observation(self._state.vertex), {"place": self.scenario.name}
+        return self._observation(self._state.vertex), {"scenario": self.scenario.name}
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive along an edge, or attempt to park; see the class."""
         if self._over:
             raise gym.error.ResetNeeded("the search has not begun, is over, or was closed: call reset()")
         number = action_number(action)
@@ -354,7 +350,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return mask
 
     def render(self) -> Any:
-        """Return a frame or text, or update the window, depending on `render_mode`."""
         if self.render_mode is None:
             gym.logger.warn(
                 'render() does nothing without a render_mode, e.g. gym.make(..., render_mode="rgb_array")'
@@ -374,16 +369,13 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return frame
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
-        """Return the lot from above."""
         assert self._renderer is not None
         return self._renderer.frame(state)
 
     def get_keys_to_action(self) -> dict[tuple[int, ...], int]:
-        """Keys of `gymnasium.utils.play`: w, s, a, d drive up, down, left, right; space parks."""
         return {(ord(key),): action for action, key in enumerate("wsad ")}
 
     def close(self) -> None:
-        """Close the window, if open, and end the episode."""
         self._over = True
         self._close_window()
 

@@ -24,9 +24,9 @@ from parkenv.engine.batch import (
     first_wrong,
 )
 from parkenv.engine.local_observation import NEAR_SLOTS
-from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecords
+from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS
+from parkenv.engine.searches import START_OPTIONS, ScenarioRecords, choose_start
 from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout
-from parkenv.engine.starts import START_OPTIONS, choose_start
 from parkenv.engine.state import SearchState
 from parkenv.errors import InputError, require_number, require_one_of, require_whole, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
 # Gymnasium's names of the masks that say which searches have a metric.
-_WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "place"))
+_WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "scenario"))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
 # Types and places of the metrics and the step's terms in a SEARCH record.
 _PLACES = [dict(SEARCH.fields or {})[name][:2] for name in (*METRICS, *STEP_FIELDS)]
@@ -71,15 +71,14 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     ## Starting state
     As in `parkenv/Search-v2`. `reset(seed=s)` gives search i the seed s + i; a sequence gives one seed to each.
-    Without a seed, every search continues with the next world of its seed. The options `entry`, `arrival` and `place`
-    hold for every search that is reset.
+    Without a seed, every search continues with the next world of its seed. The options `scenario`, `entry` and
+    `arrival` hold for every search that is reset.
 
-    ## Places
-    With several scenarios, each search draws the place of each of its episodes, also at automatic resets, as
-    `parkenv/Search-v2` does with its seed. `place_of` are the indices into `scenarios`; `info["place"]` names the
-    places after `reset`, and those of the searches that have ended. All searches share one set of tables of the places;
-    `table_bytes` and `memory_bytes` say how large they are. `n_places` limits the draw to the first scenarios, from the
-    next episodes on.
+    ## Several scenarios
+    Each search draws the scenario of each of its episodes, also at automatic resets, as `parkenv/Search-v2` does with
+    its seed. `scenario_index` are the indices into `scenarios`; `info["scenario"]` names them after `reset`, and those
+    of the searches that have ended. All searches share one set of tables; `table_bytes` and `memory_bytes` say how
+    large they are. `n_scenarios` limits the draw to the first scenarios, from the next episodes on.
 
     ## Episode end
     As in `parkenv/Search-v2`; truncated after `max_episode_steps`. `autoreset_mode` then applies:
@@ -169,7 +168,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.reward_scale = float(reward_scale)
         self.action_space = batch_space(self.single_action_space, n)
         self.observation_space = batch_space(self.single_observation_space, n)
-        self._names = np.array([one.name for one in self.scenarios])
+        self._names = np.array([scenario.name for scenario in self.scenarios])
         self._steps = Steps.of(n, self._seen["action_mask"])
         self._limit = max_episode_steps or np.iinfo(np.int64).max
         self._mode, self._copy = mode, copy
@@ -188,22 +187,22 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return {name: records[field] * -self.reward_scale for name, field in fields}
 
     @property
-    def place_of(self) -> IntArray:
-        """Index into `scenarios` of the place of each search, (n_envs,)."""
+    def scenario_index(self) -> IntArray:
+        """Index into `scenarios` of each search, (n_envs,)."""
         if len(self.scenarios) == 1:
             return np.zeros(self.num_envs, np.int64)  # without reading all records
-        place: IntArray = self._searches.records["place"].copy()
-        return place
+        index: IntArray = self._searches.records["scenario_index"].copy()
+        return index
 
     @property
-    def n_places(self) -> int:
-        """Number of scenarios, the first ones, from which the places of the next episodes are drawn; settable."""
-        return int(self._searches.records["n_places"][0])
+    def n_scenarios(self) -> int:
+        """Number of scenarios, the first ones, from which those of the next episodes are drawn; settable."""
+        return int(self._searches.records["n_scenarios"][0])
 
-    @n_places.setter
-    def n_places(self, n: int) -> None:
-        require_whole("n_places", n, least=1, most=len(self.scenarios))
-        self._searches.records["n_places"] = n
+    @n_scenarios.setter
+    def n_scenarios(self, n: int) -> None:
+        require_whole("n_scenarios", n, least=1, most=len(self.scenarios))
+        self._searches.records["n_scenarios"] = n
 
     @property
     def bytes_each(self) -> float:
@@ -255,12 +254,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             _ = self.np_random
             known = self.np_random_seed
             first = int(self.np_random.integers(1 << 62)) if known is None or known < 0 else known
-            seeds = [first + i if one is None else one for i, one in enumerate(seeds)]
+            seeds = [first + i if given is None else given for i, given in enumerate(seeds)]
         records = self._searches.records
         for i in np.flatnonzero(which):
-            one = seeds[i]
-            if one is not None:
-                records[i]["seed_state"], records[i]["episode"] = seed_state(one), -1
+            given = seeds[i]
+            if given is not None:
+                records[i]["seed_state"], records[i]["episode"] = seed_state(given), -1
             if starts:
                 choose_start(self._searches, int(i), int(records[i]["episode"]) + 1, starts)
         self._begun = True
@@ -269,10 +268,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._arrive(which)
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
         self._done = self._done & ~which
-        return self._observations(), {"place": self._names[self.place_of], "_place": which}
+        return self._observations(), {"scenario": self._names[self.scenario_index], "_scenario": which}
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End all episodes: there is no step before the next reset."""
         del kwargs
         self._begun = False
 
@@ -287,13 +285,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """
         self.observer.set_state(state)
         self._begun, self._done = True, self._nobody
-        for one in self._states:
-            one.path = [one.vertex]
+        for search in self._states:
+            search.path = [search.vertex]
 
     def step(
         self, actions: IntArray
     ) -> tuple[dict[str, NDArray[Any]], FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Take an action, (n_envs,) int, in every environment; see the class."""
         if not self._begun:
             raise gym.error.ResetNeeded("the environments have no episode yet: call reset() first")
         actions = np.asarray(actions)
@@ -337,7 +334,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return self._observations(), *results, info
 
     def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
-        """Begin fresh searches, skip idle ones, step the others."""
         self.observer.step(actions, fresh, idle, self._limit, self._steps)
         if self._searches.needs_python:
             raise_error()
@@ -345,7 +341,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             state.extend_path()
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a frame of each search, (480, 640, 3) uint8 RGB, as `parkenv/Search-v2` draws it."""
         if self.render_mode is None:
             gym.logger.warn("render() does nothing without render_mode='rgb_array'")
             return None
@@ -376,8 +371,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     def _final_observations(self, done: BoolArray) -> NDArray[np.object_]:
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done):
-            one = {name: a[i].copy() for name, a in self._seen.items()}
-            final[i] = one if self._flat is None else self._flat(one)
+            last = {name: a[i].copy() for name, a in self._seen.items()}
+            final[i] = last if self._flat is None else self._flat(last)
         return final
 
     def _metrics(self, done: BoolArray) -> dict[str, Any]:
@@ -390,11 +385,10 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         costs = words[len(METRICS) :].view(np.float64)
         terms = dict(zip(REWARD_TERMS, np.multiply(costs, -self.reward_scale, out=costs), strict=True))
         metrics["reward_terms"] = terms | dict.fromkeys(_WHICH_TERMS, done)
-        metrics["place"] = self._names[self.place_of]
+        metrics["scenario"] = self._names[self.scenario_index]
         return metrics | dict.fromkeys(_WHICH, done)
 
     def _chosen(self, given: Any) -> BoolArray:
-        """Return the mask of environments to reset: all, unless a mask is given."""
         mask = np.ones(self.num_envs, dtype=np.bool_) if given is None else np.asarray(given)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise InputError(
@@ -406,7 +400,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
 
 def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int], Observer]:
-    """Return the constructor of an observer by its name."""
     if observation == "full":
         return BeliefObserver
     if observation == "occupancy":

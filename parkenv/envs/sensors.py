@@ -38,12 +38,10 @@ class SensingSearchEnv(SearchEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; see the class."""
         self._before = None
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive along an edge, or attempt to park; see the class."""
         self._before = (self.state.vertex, self.state.time)
         return super().step(action)
 

@@ -36,7 +36,12 @@ _WANTED = {
     "less_than": "a number below {lt}",
     "less_than_equal": "a number of at most {le}",
     "model_type": "a table",
+    "dataclass_type": "a table",
+    "missing": "one more value",
+    "unexpected_keyword_argument": "no such key",
     "float_type": "a number",
+    "finite_number": "a finite number",
+    "is_instance_of": "a {class}",
     "int_type": "a whole number",
     "string_type": "text",
     "bool_type": "true or false",
@@ -215,21 +220,24 @@ def _fault(model: type[BaseModel], detail: ErrorDetails, field: str) -> str:
     if kind == "extra_forbidden":
         place = f" in [{field.rpartition('.')[0]}]" if len(location) > 1 else ""
         return f"unknown key {location[-1]!r}{place}; {nearest(str(location[-1]), _keys_at(model, location[:-1]))}"
-    wanted = detail["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    context = detail.get("ctx", {})
-    if kind in _WANTED:
-        wanted = _WANTED[kind].format(
-            **{k: f"{v:.7g}" for k, v in context.items() if isinstance(v, int | float)}
-        )
+    context, wants = detail.get("ctx", {}), wanted(detail)
     if isinstance(context.get("error"), InputError):
-        return f"{field}: {wanted}"
+        return f"{field}: {wants}"
     if kind == "whole":
-        return wanted
+        return wants
     if kind == "missing":
         return f"{field} is missing"
     value = repr(detail["input"])
     shown = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}..."
-    return f"{field} is {shown}, want {wanted}" if field else f"is {shown}, want {wanted}"
+    return f"{field} is {shown}, want {wants}" if field else f"is {shown}, want {wants}"
+
+
+def wanted(detail: ErrorDetails) -> str:
+    """Return what is wanted instead of a wrong value."""
+    if detail["type"] not in _WANTED:
+        return detail["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    numbers = {k: f"{v:.7g}" if isinstance(v, int | float) else v for k, v in detail.get("ctx", {}).items()}
+    return _WANTED[detail["type"]].format(**numbers)
 
 
 def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterator[str]:

@@ -30,12 +30,12 @@ from parkenv.scenarios.spec import (
     scenario_specs,
 )
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy.constant_map import FlatMap
+from parkenv.world.occupancy.constant_map import ConstantForecast
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import OccupancyModel, OccupancyProcess, PriorModel
-from parkenv.world.occupancy.real_week import real_week_occupancy
 from parkenv.world.occupancy.typical_week import (
     attraction,
+    real_week_occupancy,
     typical_occupancy,
     with_event,
     with_full_facilities,
@@ -125,11 +125,16 @@ def require_changes(owners: Sequence[type], changes: Iterable[str], *others: str
     Raises:
         TypeError: one is unknown; the message also lists the environment's own arguments.
     """
-    own = [one for owner in owners for one in inspect.signature(owner).parameters.values()]
-    named = [one.name for one in own if one.kind is not inspect.Parameter.VAR_KEYWORD]
+    own = [
+        name
+        for owner in owners
+        for name in inspect.signature(owner).parameters
+        if name not in ("changes", "options")
+    ]
     fields = [field.name for field in dataclasses.fields(Scenario)]
-    known = dict.fromkeys((*named, *others, *fields, "day_error"))
-    require_keywords(owners[0].__name__, changes, known)
+    require_keywords(
+        owners[0].__name__, changes, dict.fromkeys((*sorted(own), *others, *fields, "day_error"))
+    )
 
 
 def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec]:
@@ -147,14 +152,10 @@ def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:
 
 
 def build(spec: ScenarioSpec) -> Scenario:
-    """Build the scenario of a specification."""
     try:
-        lot = _lot(spec.lot)
-        goal = 0
-        if isinstance(spec.goal, tuple):
-            lot = dataclasses.replace(lot, goals=np.array([spec.goal]), goal_weights={})
-        else:
-            goal = spec.goal
+        lot, goal = _lot(spec.lot), spec.goal
+        if isinstance(goal, tuple):
+            lot, goal = dataclasses.replace(lot, goals=np.array([goal]), goal_weights={}), 0
         lot = _with_rules(lot, spec.zones)
         if not goal < len(lot.goals):
             raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
@@ -166,26 +167,20 @@ def build(spec: ScenarioSpec) -> Scenario:
             entry=spec.entry,
             v_drive=(spec.speeds.v_drive_kmh or (TOWN_KMH if lot.is_town else LOT_KMH)) * KMH,
             v_walk=spec.speeds.v_walk_kmh * KMH,
-            failure_s=spec.costs.failure_s,
-            wait_s=spec.costs.wait_s,
-            give_up_s=spec.costs.give_up_s,
+            **spec.costs.model_dump(exclude={"prices"}),
             tariff=Tariff(spec.costs.prices),
-            stay_s=spec.costs.stay_s,
-            value_of_time=spec.costs.value_of_time,
             priced_at_s=window.weekdays[0] * DAY_S + (window.start_s + window.end_s) / 2,
             sensor_model=sensor_model(spec.sensor_model),
             occupancy=occupancy,
             prior=_prior(spec.forecast, occupancy, lot, goal),
             arrival=window,
             demand=demand_of(spec.demand, lot, window),
-            traffic=Traffic()
-            if spec.traffic is None
-            else Traffic(spec.traffic.cars, spec.traffic.pedestrians),
+            traffic=Traffic(**(spec.traffic.model_dump() if spec.traffic else {})),
             rig=spec.rig,
             detector=spec.detector,
         )
         error = spec.occupancy.day_error
-        return scenario if error is None else _with_day_error(scenario, DayError(error.level, error.slope))
+        return scenario if error is None else _with_day_error(scenario, error)
     except InputError as error:
         message = str(error)
         for kind in ("goal", "entry"):
@@ -199,9 +194,8 @@ def build(spec: ScenarioSpec) -> Scenario:
 
 def _with_day_error(scenario: Scenario, day_error: DayError | float) -> Scenario:
     """Return the scenario with other days, and with a forecast that states their error, unless it is from a map."""
-    if not isinstance(day_error, DayError):
-        day_error = DayError(day_error)
-
+    with naming("day_error"):
+        day_error = day_error if isinstance(day_error, DayError) else DayError(day_error)
     occupancy, prior, walk = scenario.occupancy, scenario.prior, scenario.walk_s
     if not occupancy.adjustable:
         raise InputError(f"day_error: the occupancy is a {type(occupancy).__name__}, want a process")
@@ -212,7 +206,6 @@ def _with_day_error(scenario: Scenario, day_error: DayError | float) -> Scenario
 
 
 def _with_rules(lot: ParkingLot, zones: Mapping[str, ZoneSpec]) -> ParkingLot:
-    """Return a lot with other rules of zones."""
     if not zones:
         return lot
     rules = {name: lot.zone_rules.get(name, Zone(name)) for name in lot.zones} | dict(lot.zone_rules)
@@ -220,11 +213,8 @@ def _with_rules(lot: ParkingLot, zones: Mapping[str, ZoneSpec]) -> ParkingLot:
         with naming(f"zones.{name}"):
             if name not in rules:
                 raise InputError(f"lot {lot.name!r:.40} has no zone {name!r:.40}; {nearest(name, rules)}")
-            for user in spec.users or ():
-                if user not in lot.classes:
-                    raise InputError(
-                        f"users has {user!r:.40}, no class of the lot; {nearest(user, lot.classes)}"
-                    )
+            for user in (user for user in spec.users or () if user not in lot.classes):
+                raise InputError(f"users has {user!r:.40}, no class of the lot; {nearest(user, lot.classes)}")
             rules[name] = spec.changed_rules(rules[name])
     return lot.with_rules(rules)
 
@@ -349,8 +339,7 @@ def car_parks(file: Path) -> list[str]:
     from parkenv.forecast.counts import Counts
 
     counts = Counts.read(file)
-    odd = counts.idle()
-    return [name for name in counts.car_parks if name not in odd]
+    return [name for name in counts.car_parks if name not in counts.idle()]
 
 
 def _prior(spec: ForecastSpec, occupancy: OccupancyModel, lot: ParkingLot, goal: int) -> PriorModel | None:
@@ -359,7 +348,7 @@ def _prior(spec: ForecastSpec, occupancy: OccupancyModel, lot: ParkingLot, goal:
     if spec.process is not None:
         return _process(spec.process, lot, goal)
     if spec.flat is not None:
-        return FlatMap(spec.flat, occupancy)
+        return ConstantForecast(spec.flat, occupancy)
     if spec.map is not None:
         from parkenv.mapping.learned_map import map_prior
         from parkenv.mapping.store import MapStore
@@ -382,15 +371,11 @@ def _process(path: Path, lot: ParkingLot, goal: int) -> OccupancyProcess:
 
 
 def sensor_model(spec: SensorModelSpec) -> SensorModel:
-    """Build the sensor model of a specification."""
+    rates = spec.model_dump(include={"hit_rate", "false_alarm_rate", "view_range"}, exclude_none=True)
     if spec.name == "blind":
         model = SensorModel.blind()
     elif spec.name in ("laser", "stereo"):
         model = SensorModel.named(spec.name)
-    elif spec.file is not None:
-        model = SensorModel.from_file(spec.file)
-    elif spec.hit_rate is not None and spec.false_alarm_rate is not None:
-        model = SensorModel(hit_rate=spec.hit_rate, false_alarm_rate=spec.false_alarm_rate)
     else:
-        model = SensorModel()
-    return model if spec.view_range is None else dataclasses.replace(model, view_range=spec.view_range)
+        model = SensorModel() if spec.file is None else SensorModel.from_file(spec.file)
+    return dataclasses.replace(model, **rates)

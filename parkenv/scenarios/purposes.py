@@ -29,9 +29,9 @@ def _rates(value: object) -> object:
     numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value] * DAY_HOURS
     if len(numbers) != DAY_HOURS:
         raise ValueError(_RATES)
-    for hour, one in enumerate(numbers):
-        if isinstance(one, bool) or not isinstance(one, int | float) or not 0.0 <= one <= MAX_RATE:
-            raise ValueError(f"{_RATES}" + (f": hour {hour} has {one!r:.40}" if value is not one else ""))
+    for hour, rate in enumerate(numbers):
+        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 <= rate <= MAX_RATE:
+            raise ValueError(f"{_RATES}" + (f": hour {hour} has {rate!r:.40}" if value is not rate else ""))
     return tuple(map(float, numbers))
 
 
@@ -92,7 +92,6 @@ class PurposeSpec(Spec):
 
     @property
     def stay(self) -> Duration:
-        """Law of the stays."""
         from parkenv.world.demand import ConstantTime, ExponentialTime, LogNormalTime
 
         if self.stay_law == "log-normal":
@@ -100,7 +99,6 @@ class PurposeSpec(Spec):
         return (ConstantTime if self.stay_law == "constant" else ExponentialTime)(self.stay_s)
 
     def arrivals(self, window: ArrivalWindow) -> Arrivals:
-        """Return the arrivals in a window."""
         from parkenv.world.demand import NoArrivals, PoissonArrivals
 
         start, end = int(window.start_s // 3600), math.ceil(window.end_s / 3600)
@@ -123,46 +121,39 @@ def demand_of(
         return None
     if window.end_s <= window.start_s:
         raise InputError("arrivals.hours are one time, want hours in which the cars of `demand` arrive")
-    places = {"goals": (lot.goals, lot.goal_weights), "entries": (lot.entries, lot.entry_weights)}
-    others: dict[str, tuple[float, ...]] = {}
-    for field, (points, of_lot) in places.items():
-        some = any(getattr(one, field) for one in purposes.values())
-        others[field] = weights_of_all(of_lot) or ((1.0,) * len(points) if some else ())
-    made, users = [], {zone.name: zone.users for zone in lot.zone_rules.values()}
+    ends = {"goals": (lot.goals, lot.goal_weights), "entries": (lot.entries, lot.entry_weights)}
+    defaults: dict[str, tuple[float, ...]] = {}
+    for field, (points, of_lot) in ends.items():
+        some = any(getattr(spec, field) for spec in purposes.values())
+        defaults[field] = weights_of_all(of_lot) or ((1.0,) * len(points) if some else ())
+    users = {zone.name: zone.users for zone in lot.zone_rules.values()}
     spaces = [
         (users.get(zone, (PUBLIC,)), int(lot.capacity[lot.zone_of_slot == k].sum()))
         for k, zone in enumerate(lot.zones)
     ]
-    for name, one in purposes.items():
-        if unknown := [its for its in one.classes if its not in lot.classes[1:]]:
+    demands = []
+    for name, spec in purposes.items():
+        table = f"demand.{name}"
+        for user in (user for user in spec.classes if user not in lot.classes[1:]):
             raise InputError(
-                f"demand.{name}.classes has {unknown[0]!r:.40}, no class of lot {lot.name!r:.40} beside {PUBLIC}; "
-                f"{nearest(unknown[0], lot.classes[1:])}"
+                f"{table}.classes has {user!r:.40}, no class of lot {lot.name!r:.40} beside {PUBLIC}; "
+                f"{nearest(user, lot.classes[1:])}"
             )
-        room = sum(n for may, n in spaces if PUBLIC in may or set(may) & set(one.classes))
-        if one.parked > room:
+        room = sum(n for may, n in spaces if PUBLIC in may or set(may) & set(spec.classes))
+        if spec.parked > room:
             raise InputError(
-                f"demand.{name}.parked is {one.parked}, want at most the {room:,} spaces that it may use"
+                f"{table}.parked is {spec.parked}, want at most the {room:,} spaces that it may use"
             )
-        chosen: dict[str, tuple[float, ...]] = {}
-        for field, (points, of_lot) in places.items():
-            own = getattr(one, field) or tuple(of_lot.get(name, others[field]))
+        weights: dict[str, tuple[float, ...]] = {}
+        for field, (points, of_lot) in ends.items():
+            weights[field] = own = getattr(spec, field) or tuple(of_lot.get(name, defaults[field]))
             if own and len(own) != len(points):
                 raise InputError(
-                    f"demand.{name}.{field} has {len(own)} numbers, the lot has {len(points)} of these"
+                    f"{table}.{field} has {len(own)} numbers, the lot has {len(points)} of these"
                 )
-            chosen[field] = own
-        with naming(f"demand.{name}"):
-            made.append(
-                Demand(
-                    one.arrivals(window),
-                    one.stay,
-                    ConstantTime(one.patience_s),
-                    chosen["entries"],
-                    chosen["goals"],
-                    name=name,
-                    **one.model_dump(include={"value_of_time", "classes", "walks_back", "kwh", "parked"}),
-                )
-            )
+        rest = spec.model_dump(include={"value_of_time", "classes", "walks_back", "kwh", "parked"})
+        laws = spec.arrivals(window), spec.stay, ConstantTime(spec.patience_s)
+        with naming(table):
+            demands.append(Demand(*laws, weights["entries"], weights["goals"], name=name, **rest))
     with naming("demand"):
-        return TownDemand(tuple(made))
+        return TownDemand(tuple(demands))

@@ -1,4 +1,4 @@
-"""Which of several scenarios an episode is in, and which are kept from training, to evaluate on."""
+"""Which of several scenarios an episode is in, which are kept from training, and scenarios without observations."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from parkenv.compiled.keyed_random import PLACE_STREAM, keyed_uniform, world_key
+from parkenv.compiled.keyed_random import SCENARIO_STREAM, keyed_uniform, world_key
 from parkenv.errors import InputError
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
+from parkenv.world.sensor_model import SensorModel
 
+BLIND = "-blind"
+"""Suffix of the names of these scenarios."""
 FIRST_SHARE, ALL_AT = 0.1, 0.5
 """A curriculum begins with this share of the scenarios, and has all of them after this share of the training."""
 
@@ -24,7 +27,7 @@ def scenario_of_episode(seed: int, episode: int, n: int) -> int:
         >>> [scenario_of_episode(seed, 0, 3) for seed in range(5)]
         [2, 0, 1, 0, 0]
     """
-    return int(keyed_uniform(world_key(seed, episode), PLACE_STREAM, 0, 0) * n)
+    return int(keyed_uniform(world_key(seed, episode), SCENARIO_STREAM, 0, 0) * n)
 
 
 def seeds_by_scenario(seeds: Sequence[int], n: int) -> list[list[int]]:
@@ -50,14 +53,9 @@ def lot_share(lot: ParkingLot) -> float:
 
 
 def split_by_lot(scenarios: Sequence[Scenario], held_out: float) -> tuple[list[Scenario], list[Scenario]]:
-    """Split scenarios by their lots: those to train on, and those held out.
+    """Split scenarios by their lots: those to train on, and those held out, whose `lot_share` is below `held_out`.
 
-    A lot is held out if its `lot_share` is below `held_out`. So scenarios on one lot are on one side, and lots that are
-    added later do not move the others.
-
-    Args:
-        scenarios: the scenarios.
-        held_out: share that is held out.
+    So scenarios on one lot are on one side, and lots that are added later do not move the others.
     """
     sides: tuple[list[Scenario], list[Scenario]] = ([], [])
     for scenario in scenarios:
@@ -93,3 +91,8 @@ def require_different_names(scenarios: Sequence[Scenario]) -> None:
     for i, name in enumerate(names):
         if name in names[:i]:
             raise InputError(f"scenarios has {name!r} twice, want different names")
+
+
+def blind_scenario(scenario: Scenario) -> Scenario:
+    """Return a renamed scenario in which slots are not observed before a parking attempt."""
+    return scenario.replace(name=f"{scenario.name}{BLIND}", sensor_model=SensorModel.blind())

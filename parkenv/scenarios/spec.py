@@ -27,6 +27,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from parkenv.errors import InputError, nearest
+from parkenv.files.field_types import Probability
 from parkenv.files.known_names import (
     DETECTORS,
     LOT_SUFFIXES,
@@ -52,7 +53,7 @@ from parkenv.files.spec_file import (
 from parkenv.files.user_class import find_module
 from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.occupancy.day_error import MAX_LOGITS
+from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
 from parkenv.world.tariff import NO_ZONE, VALUE_OF_TIME, Price, Zone, parse_change
 from parkenv.world.tariff import Hours as ZoneHours
@@ -62,7 +63,6 @@ Speed = Annotated[float, Field(ge=0.1, le=300.0)]
 """km/h."""
 Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]
 """s, at most a day."""
-Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=0, le=1_000)]
 Size = Annotated[float, Field(ge=1.0, le=100.0)]  # m
 MAX_SLOTS = 1_000_000
@@ -130,8 +130,8 @@ class LotSpec(Spec):
         return self
 
 
-class TypicalWeek(Spec):
-    """A working week: full by day, empty by night, fuller near the goal."""
+class _Popularity(Spec):
+    """Which slots drivers like, and how long they stay."""
 
     pull: float = Field(
         1.6, ge=-20, le=20, description="Rise of demand from the middle of the lot to the goal, logits."
@@ -139,8 +139,13 @@ class TypicalWeek(Spec):
     unevenness: float = Field(
         0.6, ge=0, le=20, description="Standard deviation between slots equally near to the goal, logits."
     )
-    demand: float = Field(0.0, ge=-50, le=50, description="Logits added at every hour.")
     mean_stay_s: float = Field(7200.0, ge=1.0, le=1e7)
+
+
+class TypicalWeek(_Popularity):
+    """A working week: full by day, empty by night, fuller near the goal."""
+
+    demand: float = Field(0.0, ge=-50, le=50, description="Logits added at every hour.")
     goal: int | None = Field(
         None, ge=0, description="Index of the goal with the demand; the scenario's own if absent."
     )
@@ -221,18 +226,6 @@ def _day_error_text(text: str) -> object:
     return dict(zip(("level", "slope"), numbers_in(text, min(text.count(",") + 1, 2)), strict=False))
 
 
-Deviation = Annotated[float, Field(ge=0.0, le=MAX_LOGITS)]
-
-
-class DayErrorSpec(Spec):
-    """How far whole days differ from the forecast: standard deviations over days, logits; or one number, the level."""
-
-    level: Deviation = Field(0.0, description="Standard deviation of the shift of all slots at once.")
-    slope: Deviation = Field(
-        0.0, description="Standard deviation of the additional rise from the lot's middle to the goal."
-    )
-
-
 class OrNumber:
     """Annotation of a table that may also be given as a number: the JSON schema allows both."""
 
@@ -242,7 +235,7 @@ class OrNumber:
         return {"anyOf": [{"type": "number"}, handler(core_schema)]}
 
 
-class CountsSpec(Spec):
+class CountsSpec(_Popularity):
     """Days of a car park of which the number of free places was counted every hour, replayed on the lot."""
 
     file: FilePath = Field(
@@ -260,13 +253,6 @@ class CountsSpec(Spec):
         ),
     ] = Field(description="Name of the car park in the file.")
     timezone: str = Field("Europe/Berlin", description="Local time zone, for `hour_utc` and `time_utc`.")
-    pull: float = Field(
-        1.6, ge=-20, le=20, description="Rise of demand from the middle of the lot to the goal, logits."
-    )
-    unevenness: float = Field(
-        0.6, ge=0, le=20, description="Standard deviation between slots equally near to the goal, logits."
-    )
-    mean_stay_s: float = Field(7200.0, ge=1.0, le=1e7)
 
 
 class OccupancySpec(Spec):
@@ -309,7 +295,7 @@ class OccupancySpec(Spec):
         default="the log's fullest slots are nearest to the goal",
     )
     event: Event | None = None
-    day_error: Annotated[DayErrorSpec, BeforeValidator(_day_error_tables), OrNumber()] | None = option(
+    day_error: Annotated[DayError, BeforeValidator(_day_error_tables), OrNumber()] | None = option(
         None,
         "Difference of whole days from the forecast: standard deviations, logits, of their level "
         "and of their slope to the goal; 0: days are as forecast.",
@@ -344,7 +330,6 @@ class OccupancySpec(Spec):
         return self
 
     def files(self) -> list[Path]:
-        """Return every file named in the specification, and the module of a world."""
         module = find_module(self.world) if self.world else None
         return [*super().files(), *([Path(module)] if module else [])]
 
@@ -416,7 +401,6 @@ class Arrivals(Spec):
     )
 
     def window(self) -> ArrivalWindow:
-        """The arrival window."""
         return ArrivalWindow.parse(self.hours, self.days)
 
 
@@ -434,7 +418,6 @@ MAX_PRICE = 1e6
 
 
 def _per_hour(text: str) -> float:
-    """Parse AMOUNT/h; the unit may be left out."""
     return Price.parse(text).per_hour
 
 
@@ -618,7 +601,7 @@ _MERGED = ("arrivals", "costs", "demand", "speeds", "zones")
 def _merged(base: object, value: object) -> object:
     if not (isinstance(base, Mapping) and isinstance(value, Mapping)):
         return value
-    return {**base, **{name: _merged(base.get(name), its) for name, its in value.items()}}
+    return {**base, **{name: _merged(base.get(name), own) for name, own in value.items()}}
 
 
 def _lot_or_base(schema: dict[str, Any]) -> None:
@@ -684,7 +667,6 @@ class ScenarioSpec(Spec):
     @model_validator(mode="before")
     @classmethod
     def _complete(cls, tables: Any) -> Any:
-        """Add what the base has."""
         if not isinstance(tables, Mapping) or tables.get("base") is None:
             return tables
         if tables["base"] not in SCENARIO_NAMES:
@@ -719,7 +701,6 @@ class ScenarioSpec(Spec):
         return spec
 
     def files(self) -> list[Path]:
-        """Return every file named in the specification, and the settings beside the detector's."""
         files = super().files()
         if self.detector not in DETECTORS:
             detector = Path(self.detector)
@@ -757,11 +738,9 @@ def scenario_spec(source: str | Path) -> ScenarioSpec:
 def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
     """Return the specifications that a name, a file or a folder stands for.
 
-    Args:
-        source: name of a packaged scenario; a scenario file (.toml, .json); a lot file (.geojson, .yml), which has a
-            week as counted in real car parks (`lot_scenario`); or a folder with scenario files (.toml) and lot
-            files (.geojson), in order of their names. A lot that a scenario file of the folder names is that
-            scenario's.
+    A lot file (.geojson, .yml) has a week as counted in real car parks (`lot_scenario`). In a folder, scenario files
+    (.toml) and lot files (.geojson) follow in order of their names; a lot that a scenario file of it names is that
+    scenario's.
 
     Examples:
         >>> [spec.title for spec in scenario_specs("mini")]
@@ -782,15 +761,10 @@ def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
 
 
 def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
-    """Return the scenario of a lot alone: the lot's first goal, any of its entries, a week as in busy real car parks.
+    """Return the scenario of a packaged lot or a lot file alone: first goal, any entry, week of busy real car parks.
 
-    The week and how days differ from it are derived from counts of real car parks, see
-    `parkenv.world.occupancy.real_week`: on
+    Week and days are derived from counts of real car parks, see `parkenv.world.occupancy.real_week_figures`: on
     workdays fuller than nine in ten of them, 55 % at 8:00 and 82 % at 11:00, more near the goal.
-
-    Args:
-        lot: name of a packaged lot, or a lot file.
-        source: source of the name for messages.  [default: the lot]
     """
     name = "".join(c if c.isprintable() and c not in "/\\," else " " for c in Path(lot).stem)[:80]
     tables = {"name": name, "lot": str(lot), "occupancy": {"real_week": {}, "day_error": DAY_ERROR}}
@@ -798,7 +772,6 @@ def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
 
 
 def _in_folder(folder: Path) -> list[ScenarioSpec]:
-    """Return the scenarios of the files in a folder."""
     try:
         files = sorted(path for path in folder.iterdir() if path.suffix in (".toml", ".geojson"))
     except OSError as error:

@@ -137,7 +137,7 @@ class EpisodeRunner:
         recorder = SearchRecorder(self.agent, recorded.append if moments else None)
         result = simulate(self.env, self.agent, seed, (recorder, *observers))
         metrics = {
-            name: value for name, value in result.info.items() if name not in ("reward_terms", "place")
+            name: value for name, value in result.info.items() if name not in ("reward_terms", "scenario")
         }
         state, scenario = self._state, self.scenario
         return SearchRecord(

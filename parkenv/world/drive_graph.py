@@ -100,12 +100,10 @@ class Centrelines:
         return Chains(first.ravel(), last.ravel(), leaving, drivable.ravel(), self.node_xy)
 
     def legs_at(self, station: FloatArray) -> IntArray:
-        """Return the leg of each station."""
         leg = np.searchsorted(self.station[self.leg_start], station, side="right") - 1
         return np.clip(leg, 0, len(self.leg_start) - 1)
 
     def points_at(self, station: FloatArray, leg: IntArray) -> FloatArray:
-        """Return the points at stations on their legs, (n, 2) m."""
         start = self.leg_start[leg]
         return self.xy[start] + (station - self.station[start])[:, None] * self.leg_tangent[leg]
 
@@ -123,13 +121,8 @@ def build_drive_graph(
 ) -> DriveGraph:
     """Build the drive graph: assign slots and entries to lanes, and connect vertices by moves.
 
-    Args:
-        lanes: of each its centre line, (k, 2) m, whether it is one-way in the order of its points, and its speed.
-            Lanes are connected where they share a point.
-        mouth_xy: (n_slots, 2) m, middle of the side by which each slot is entered.
-        entry_xy: (n_entries, 2) m.
-        turns: those that cars may not make, or that are the only ones.
-        side: 1 where cars keep to the right, -1 where they keep to the left and all of this is its mirror image.
+    Slots are given by the middles of the sides by which they are entered, (n_slots, 2) m. Lanes are connected where
+    they share a point. With `side` -1 cars keep to the left, and all of this is its mirror image.
 
     Raises:
         GraphError: a slot or an entry out of reach of all lanes, a junction with more than four lanes out, or a turn
@@ -292,7 +285,7 @@ def _attach_slots(lines: Centrelines, mouth_xy: FloatArray) -> tuple[FloatArray,
     start = lines.leg_start
     ends = np.stack([lines.xy[start], lines.xy[start + 1]], axis=1)
     tree = shapely.STRtree(np.asarray(shapely.linestrings(ends)))
-    (found, leg), distance = tree.query_nearest(
+    (index, leg), distance = tree.query_nearest(
         shapely.points(mouth_xy), all_matches=False, return_distance=True
     )
     problems = [
@@ -302,12 +295,12 @@ def _attach_slots(lines: Centrelines, mouth_xy: FloatArray) -> tuple[FloatArray,
             f"is on no lane: the nearest is {d:.1f} m from its mouth, want at most {SLOT_REACH:g} m",
             (float(mouth_xy[i, 0]), float(mouth_xy[i, 1])),
         )
-        for i, d in zip(found, distance, strict=True)
+        for i, d in zip(index, distance, strict=True)
         if d > SLOT_REACH
     ]
     if problems:
         raise GraphError(problems)
-    leg = leg[np.argsort(found)].astype(np.int64)
+    leg = leg[np.argsort(index)].astype(np.int64)
     away = mouth_xy - lines.xy[start[leg]]
     tangent = lines.leg_tangent[leg]
     leg_length = lines.station[start[leg] + 1] - lines.station[start[leg]]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 import shapely
+from pydantic import BeforeValidator, Field
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, require_number, require_one_of, require_whole
-from parkenv.files.file_names import is_plain
+from parkenv.errors import InputError, require_one_of
+from parkenv.files.field_types import Name, NotNegative, Number, Validated, Whole
 from parkenv.world.drive_graph import GraphError, GraphProblem, linestrings
 
 FACILITY_KINDS = ("kerb", "lot", "garage")
@@ -21,8 +23,12 @@ NOMINAL_SLOT = (5.0, 2.5)  # length and width, m, of the one slot that stands fo
 KERB_DISTANCE = 3.0  # m, from the centre line of the lane to that slot
 
 
+def _two_numbers(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list | np.ndarray) else value
+
+
 @dataclass(frozen=True)
-class Facility:
+class Facility(Validated):
     """A kerb, a car park or a garage.
 
     It groups the slots of a lot that name it or, with a capacity, it is *counted*: one slot of the lot, at the lane
@@ -40,39 +46,22 @@ class Facility:
         delay_s: s by which a live count lags behind.
     """
 
-    name: str
+    name: Annotated[Name, Field(min_length=1)]
     kind: str = "lot"
-    zone: str = ""
-    capacity: int = 0
-    xy: tuple[float, float] | None = None
-    gate_s: float = 0.0
-    inside_s: tuple[float, float] = (0.0, 0.0)
+    zone: Name = ""
+    capacity: Annotated[Whole, Field(le=1_000_000)] = 0
+    xy: Annotated[tuple[Number, Number], BeforeValidator(_two_numbers)] | None = None
+    gate_s: NotNegative = 0.0
+    inside_s: Annotated[tuple[NotNegative, NotNegative], BeforeValidator(_two_numbers)] = (0.0, 0.0)
     known: str = "nothing"
-    delay_s: float = 0.0
+    delay_s: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name or not is_plain(self.name):
-            raise InputError(f"name is {self.name!a:.40}, want a text")
+        super().__post_init__()
         require_one_of("type", self.kind, FACILITY_KINDS)
-        if not isinstance(self.zone, str) or not is_plain(self.zone):
-            raise InputError(f"zone is {self.zone!a:.40}, want a name")
-        require_whole("capacity", self.capacity, most=1_000_000)
+        require_one_of("known", self.known, KNOWN)
         if self.is_counted and self.xy is None:
             raise InputError("xy is None, want where the counted facility is entered")
-        require_number("gate_s", self.gate_s, least=0.0)
-        if not isinstance(self.inside_s, Sequence) or len(self.inside_s) != 2:
-            raise InputError(f"inside_s is {self.inside_s!r:.40}, want two numbers: when empty, when full")
-        for seconds in self.inside_s:
-            require_number("inside_s", seconds, least=0.0)
-        object.__setattr__(self, "inside_s", tuple(map(float, self.inside_s)))
-        require_one_of("known", self.known, KNOWN)
-        require_number("delay_s", self.delay_s, least=0.0)
-        if self.xy is not None:
-            if not isinstance(self.xy, Sequence | np.ndarray) or len(self.xy) != 2:
-                raise InputError(f"xy is {self.xy!r:.40}, want two numbers, in m")
-            for coordinate in self.xy:
-                require_number("xy", coordinate)
-            object.__setattr__(self, "xy", tuple(map(float, self.xy)))
 
     @property
     def is_counted(self) -> bool:
@@ -87,10 +76,6 @@ def nominal_slots(
 
     A slot stands at right angles to its lane, on the side of the facility's point, and is entered from its rear.
 
-    Args:
-        facilities: those of a lot; only the counted ones have such a slot.
-        lanes: (k, 2) m, centre lines.
-
     Raises:
         GraphError: a facility out of reach of all lanes; the message names it.
     """
@@ -98,10 +83,10 @@ def nominal_slots(
     tree = shapely.STRtree(linestrings(list(legs)))
     counted = [i for i, facility in enumerate(facilities) if facility.is_counted]
     points = np.array([facilities[i].xy for i in counted])
-    (found, leg), distance = tree.query_nearest(
+    (index, leg), distance = tree.query_nearest(
         shapely.points(points), all_matches=False, return_distance=True
     )
-    order = np.argsort(found)
+    order = np.argsort(index)
     leg, distance = leg[order], distance[order]
     far = [
         facility_problem(

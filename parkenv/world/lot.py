@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, nearest, require_number
+from parkenv.files.field_types import Flag, Number, Validated
 from parkenv.files.file_names import is_plain
 from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
 from parkenv.world.facility import NOMINAL_SLOT, Facility, facility_problem, nominal_slots
@@ -52,7 +54,7 @@ class _ByValue:
 
 
 @dataclass(frozen=True, eq=False)
-class Lane(_ByValue):
+class Lane(Validated, _ByValue):
     """A drivable centre line.
 
     Args:
@@ -67,10 +69,10 @@ class Lane(_ByValue):
 
     points: FloatArray
     oneway: bool = False
-    speed: float = 1.0
+    speed: Annotated[Number, Field(ge=0.05, le=20.0)] = 1.0
 
     def __post_init__(self) -> None:
-        require_number("lane: speed", self.speed, least=0.05, most=20.0)
+        super().__post_init__()
         points = _frozen(self.points, "points")
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
             raise InputError(f"lane points: shape {points.shape}, want (at least 2, 2)")
@@ -83,7 +85,7 @@ class Lane(_ByValue):
 
 
 @dataclass(frozen=True, eq=False)
-class Turn(_ByValue):
+class Turn(Validated, _ByValue):
     """A turn restriction: a turn at a junction that is prohibited, or mandatory.
 
     Args:
@@ -93,14 +95,13 @@ class Turn(_ByValue):
     """
 
     points: FloatArray
-    only: bool = False
+    only: Flag = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         points = _frozen(self.points, "points")
         if points.shape != (3, 2):
             raise InputError(f"turn points: shape {points.shape}, want (3, 2)")
-        if not isinstance(self.only, bool):
-            raise InputError(f"turn only is {self.only!r}, want True or False")
         _require_finite("turn points", points)
         object.__setattr__(self, "points", points)
 
@@ -204,20 +205,15 @@ class ParkingLot(_ByValue):
     classes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        def set_field(name: str, value: object) -> None:
-            object.__setattr__(self, name, value)
-
-        set_field("slot_ids", tuple(self.slot_ids))
-        set_field("lanes", tuple(self.lanes))
-        set_field("turns", tuple(self.turns))
-        set_field("facilities", tuple(self.facilities))
-        self._set_counted(set_field)
+        for name in ("slot_ids", "lanes", "turns", "facilities"):
+            self._set(name, tuple(getattr(self, name)))
+        self._set_counted()
         self._require_names()
         n = len(self.slot_ids)
         if np.size(self.slot_parking_cost_s) == 0:
-            set_field("slot_parking_cost_s", np.zeros(n))
-        self._set_facilities(set_field)
-        self._set_zones(set_field)
+            self._set("slot_parking_cost_s", np.zeros(n))
+        self._set_facilities()
+        self._set_zones()
         for name, shape in (
             ("slot_xy", (n, 2)),
             ("slot_yaw", (n,)),
@@ -231,20 +227,20 @@ class ParkingLot(_ByValue):
             if values.shape != shape:
                 raise InputError(f"lot {self.name!r}: {name} has shape {values.shape}, want {shape}")
             _require_finite(f"lot {self.name!r}: {name}", values)
-            set_field(name, values)
-        for name in ("slot_length", "slot_width"):
-            least = getattr(self, name).min()
-            if least < SLOT_SIDE:
-                raise InputError(f"lot {self.name!r}: {name} {least:g} m, want at least {SLOT_SIDE:g}")
-        if self.slot_parking_cost_s.min() < 0.0:
-            least = self.slot_parking_cost_s.min()
-            raise InputError(f"lot {self.name!r}: slot_parking_cost_s {least:g} s, want at least 0")
+            self._set(name, values)
+        for name, least in (
+            ("slot_length", SLOT_SIDE),
+            ("slot_width", SLOT_SIDE),
+            ("slot_parking_cost_s", 0.0),
+        ):
+            if (value := getattr(self, name).min()) < least:
+                raise InputError(f"lot {self.name!r}: {name} {value:g}, want at least {least:g}")
         mouth = np.array(self.slot_mouth, dtype=np.int8)
         if mouth.shape != (n,) or not np.isin(mouth, list(Mouth)).all():
             raise InputError(f"lot {self.name!r}: slot_mouth must hold {n} values of {list(map(int, Mouth))}")
         mouth.flags.writeable = False
-        set_field("slot_mouth", mouth)
-        self._set_walls(set_field)
+        self._set("slot_mouth", mouth)
+        self._set_walls()
         for kind, features in (("lane", self.lanes), ("entry", self.entries), ("goal", self.goals)):
             if len(features) == 0:
                 raise InputError(f"lot {self.name!r} has no {kind}")
@@ -259,20 +255,23 @@ class ParkingLot(_ByValue):
         for name in ("vertex_xy", "vertex_yaw", "neighbors", "edge_length", "edge_speed", "entry_vertices"):
             values = getattr(graph, name)
             values.flags.writeable = False
-            set_field(name, values)
+            self._set(name, values)
         self._require_reachable()
         for name, points in (("goal_weights", self.goals), ("entry_weights", self.entries)):
-            set_field(name, self._weights(name, len(points)))
+            self._set(name, self._weights(name, len(points)))
 
-    def _set_walls(self, set_field: Callable[[str, object], None]) -> None:
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    def _set_walls(self) -> None:
         walls = tuple(_frozen(wall, "walls") for wall in self.walls)
         for wall in walls:
             if wall.ndim != 2 or wall.shape[1] != 2 or len(wall) < 2:
                 raise InputError(f"lot {self.name!r}: a wall has shape {wall.shape}, want (at least 2, 2)")
             _require_finite(f"lot {self.name!r}: walls", wall)
-        set_field("walls", walls)
+        self._set("walls", walls)
 
-    def _set_counted(self, set_field: Callable[[str, object], None]) -> None:
+    def _set_counted(self) -> None:
         """Append the slots of counted facilities that are missing, and place all of them beside their lanes."""
         counted = [facility for facility in self.facilities if facility.is_counted]
         if not counted:
@@ -285,7 +284,7 @@ class ParkingLot(_ByValue):
             if self.lanes
             else (np.zeros((len(counted), 2)), np.zeros(len(counted)))
         )
-        set_field("slot_ids", self.slot_ids[:drawn] + names)
+        self._set("slot_ids", self.slot_ids[:drawn] + names)
         for name, values in (
             ("slot_xy", xy),
             ("slot_yaw", yaw),
@@ -301,10 +300,9 @@ class ParkingLot(_ByValue):
                 column = np.zeros(drawn, values.dtype)
             if len(column) not in (drawn, n):
                 raise InputError(f"lot {self.name!r}: {name} has {len(column)} values, want {n}")
-            set_field(name, np.concatenate([column[:drawn].reshape(-1, *values.shape[1:]), values]))
+            self._set(name, np.concatenate([column[:drawn].reshape(-1, *values.shape[1:]), values]))
 
-    def _set_facilities(self, set_field: Callable[[str, object], None]) -> None:
-        """Number the facilities of the slots."""
+    def _set_facilities(self) -> None:
         n, what = len(self.slot_ids), f"lot {self.name!r}"
         names = [facility.name for facility in self.facilities]
         order = {name: i for i, name in enumerate(names)}
@@ -330,10 +328,9 @@ class ParkingLot(_ByValue):
                 capacity[index == i] = facility.capacity
         for name, values in (("slot_facility", given), ("facility_of_slot", index), ("capacity", capacity)):
             values.flags.writeable = False
-            set_field(name, values)
+            self._set(name, values)
 
     def _require_reachable(self) -> None:
-        """Require that an entry leads to every counted facility."""
         counted = np.flatnonzero(self.is_counted)
         if not len(counted):
             return
@@ -346,21 +343,17 @@ class ParkingLot(_ByValue):
             raise GraphError([facility_problem(self.facilities[i], i, reason) for i in lost])
 
     def _weights(self, name: str, count: int) -> dict[str, FloatArray]:
-        """Return validated weights by purpose."""
         weights = {}
         for purpose, given in getattr(self, name).items():
-            values = _frozen(given, f"lot {self.name!r}: {name}[{purpose!r:.40}]")
+            what = f"lot {self.name!r}: {name}[{purpose!r:.40}]"
+            weights[purpose] = values = _frozen(given, what)
             if values.shape != (count,):
-                raise InputError(
-                    f"lot {self.name!r}: {name}[{purpose!r:.40}] has shape {values.shape}, want ({count},)"
-                )
+                raise InputError(f"{what} has shape {values.shape}, want ({count},)")
             for value in values.tolist():
-                require_number(f"lot {self.name!r}: {name}[{purpose!r:.40}]", value, least=0.0)
-            weights[purpose] = values
+                require_number(what, value, least=0.0)
         return weights
 
-    def _set_zones(self, set_field: Callable[[str, object], None]) -> None:
-        """Number the zones of the slots, and require printable names."""
+    def _set_zones(self) -> None:
         n = len(self.slot_ids)
         zone = np.array(self.slot_zone if np.size(self.slot_zone) else [""] * n, dtype=np.str_)
         if zone.shape != (n,):
@@ -370,12 +363,12 @@ class ParkingLot(_ByValue):
             inherited = np.array([*(facility.zone for facility in self.facilities), ""])
             zone = np.where(zone == "", inherited[self.facility_of_slot], zone)
         zone.flags.writeable = False
-        set_field("slot_zone", zone)
-        set_field("zones", tuple(sorted({name or NO_ZONE for name in zone.tolist()})))
+        self._set("slot_zone", zone)
+        self._set("zones", tuple(sorted({name or NO_ZONE for name in zone.tolist()})))
         order = {name: i for i, name in enumerate(self.zones)}
         zone_of_slot = np.array([order[name or NO_ZONE] for name in zone.tolist()], np.int64)
         zone_of_slot.flags.writeable = False
-        set_field("zone_of_slot", zone_of_slot)
+        self._set("zone_of_slot", zone_of_slot)
         for name in self.zones:
             if not is_plain(name):
                 raise InputError(f"lot {self.name!r}: zone {name!a:.60} has control characters")
@@ -383,12 +376,12 @@ class ParkingLot(_ByValue):
                 raise InputError(
                     f"lot {self.name!r} has no rules of zone {name!r:.40}; {nearest(name, self.zone_rules)}"
                 )
-        set_field("zone_rules", dict(self.zone_rules))
+        self._set("zone_rules", dict(self.zone_rules))
         for name, rules in self.zone_rules.items():
             if name != rules.name:
                 raise InputError(f"lot {self.name!r}: zone_rules[{name!r:.40}] is of zone {rules.name!r:.40}")
         users = {user for rules in self.zone_rules.values() for user in rules.users}
-        set_field("classes", (PUBLIC, *sorted(users - {PUBLIC})))
+        self._set("classes", (PUBLIC, *sorted(users - {PUBLIC})))
 
     def with_rules(self, zone_rules: Mapping[str, Zone]) -> ParkingLot:
         """Return the lot with other rules of its zones, on the same drive graph.
@@ -397,23 +390,18 @@ class ParkingLot(_ByValue):
             InputError: see the class.
         """
         lot = copy.copy(self)
-        set_field = partial(object.__setattr__, lot)
-        set_field("zone_rules", zone_rules)
-        lot._set_zones(set_field)
+        lot._set("zone_rules", zone_rules)
+        lot._set_zones()
         return lot
 
     def _require_names(self) -> None:
-        """Require slots with different names, all of them printable."""
         if len(self.slot_ids) == 0:
             raise InputError(f"lot {self.name!r} has no slot")
         for name in (self.name, *self.slot_ids):
             if not is_plain(name):
                 raise InputError(f"lot: name {name!a:.60} has control characters")
-        seen: set[str] = set()
-        for name in self.slot_ids:
-            if name in seen:
-                raise InputError(f"lot {self.name!r}: slot id {name!r} appears twice")
-            seen.add(name)
+        if repeated := [name for name, count in Counter(self.slot_ids).items() if count > 1]:
+            raise InputError(f"lot {self.name!r}: slot id {repeated[0]!r} appears twice")
 
     def __repr__(self) -> str:
         return f"ParkingLot({self.name!r}, {self.n_slots} slots, {self.n_vertices} vertices)"
@@ -476,15 +464,8 @@ class ParkingLot(_ByValue):
 
     def bounds(self) -> tuple[float, float, float, float]:
         """Bounding box of all features: least x and y, greatest x and y, m."""
-        points = np.concatenate(
-            [
-                self.slot_corners().reshape(-1, 2),
-                *(lane.points for lane in self.lanes),
-                self.entries,
-                self.goals,
-                *self.walls,
-            ]
-        )
+        lanes = (lane.points for lane in self.lanes)
+        points = np.concatenate([*self.slot_corners(), *lanes, self.entries, self.goals, *self.walls])
         low, high = points.min(axis=0), points.max(axis=0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 

@@ -25,16 +25,11 @@ _SLOT_LOTS: OrderedDict[bytes, SlotLot] = OrderedDict()
 
 
 def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
-    """Convert a lot for `sim_sensors`: `slot_lot(lot).scene(occupied)` is its scene.
+    """Convert a lot for `sim_sensors`: `slot_lot(lot).scene(occupied)` is its scene, in which place i is slot i.
 
-    Closed walls become buildings, open ones free-standing walls. Place i of the scene is slot i, in the lot's frame.
-
-    Within a process, equal lots share one object: the ground texture and the vehicle meshes take seconds to create, and
-    every task of a worker process has a new copy of its lot.
-
-    Args:
-        lot: the lot.
-        seed: seed of vehicle models and textures.
+    Closed walls become buildings, open ones free-standing walls; `seed` is that of vehicle models and textures. Within
+    a process, equal lots share one object: the ground texture and the vehicle meshes take seconds to create, and every
+    task of a worker process has a new copy of its lot.
     """
     key = _content(lot, seed)
     if key not in _SLOT_LOTS:
@@ -46,7 +41,6 @@ def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
 
 
 def _content(lot: ParkingLot, seed: int) -> bytes:
-    """Hash everything of the lot that its scene depends on."""
     digest = hashlib.sha256(str(seed).encode())
     columns = (lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width, lot.slot_mouth)
     for array in (*columns, *lot.walls, *(lane.points for lane in lot.lanes)):
@@ -78,15 +72,9 @@ def _make_slot_lot(lot: ParkingLot, seed: int) -> SlotLot:
 
 
 class LotScenes:
-    """Scenes of one world over time.
+    """Scenes of one world, that of a key, over time.
 
     Parked cars and traffic depend only on the world. Consecutive scenes are updated incrementally.
-
-    Args:
-        slots: `slot_lot` of the scenario's lot.
-        scenario: defines lot and traffic.
-        key: key of the world.
-        world: occupancy of the slots over time.
     """
 
     def __init__(self, slots: SlotLot, scenario: Scenario, key: np.uint64, world: World) -> None:
@@ -98,12 +86,7 @@ class LotScenes:
         self._scene: Scene | None = None
 
     def at(self, time: float, ego: FloatArray | None = None) -> Scene:
-        """Return the scene at a time; place i is slot i.
-
-        Args:
-            time: s, at or after the world's arrival.
-            ego: (3,) x, y in m and yaw in rad of the car with the sensors, which is not part of the scene.
-        """
+        """Return the scene at a time, s, without the car with the sensors, which is at `ego`, (3,) x, y, yaw."""
         taken = self._world.occupied(self._everything, time)
         sojourn = self._world.sojourn(self._everything, time)
         if self._scene is None:

@@ -11,15 +11,17 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import InstanceOf
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.errors import InputError, nearest, require_keywords, require_number
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.errors import InputError, nearest, require_keywords, require_whole
+from parkenv.files.field_types import NotNegative, Positive, Validated
 from parkenv.world.demand import Demand, TownDemand
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
+from parkenv.world.occupancy.process import Arrival, ArrivalDay, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
 from parkenv.world.tariff import VALUE_OF_TIME, Hours, Tariff, Zone
 from parkenv.world.traffic import Traffic
@@ -35,6 +37,7 @@ _OF_ALL_GOALS = (
     "slots_in_view",
     "sight_lines",
     "sensor_rates",
+    "live_drive_s",
 )
 """Cached properties of a problem that do not depend on its goal."""
 EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
@@ -55,7 +58,7 @@ class Drivers(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SearchProblem:
+class SearchProblem(Validated):
     """The public part of a search: lot, goal, speeds, costs and sensor model.
 
     Args:
@@ -80,35 +83,26 @@ class SearchProblem:
         InputError: a value out of its range; the message names the field.
     """
 
-    lot: ParkingLot
+    lot: InstanceOf[ParkingLot]
     goal: int = 0
-    v_drive: float = 10 * KMH
-    v_walk: float = 4 * KMH
-    failure_s: float = 10.0
-    wait_s: float = 1.0
-    give_up_s: float = 1800.0
-    sensor_model: SensorModel = field(default_factory=SensorModel)
-    tariff: Tariff = field(default_factory=Tariff)
-    stay_s: float = HOUR_S
-    value_of_time: float = VALUE_OF_TIME
-    priced_at_s: float = 34 * HOUR_S
+    v_drive: Positive = 10 * KMH
+    v_walk: Positive = 4 * KMH
+    failure_s: NotNegative = 10.0
+    wait_s: Positive = 1.0
+    give_up_s: NotNegative = 1800.0
+    sensor_model: InstanceOf[SensorModel] = field(default_factory=SensorModel)
+    tariff: InstanceOf[Tariff] = field(default_factory=Tariff)
+    stay_s: NotNegative = HOUR_S
+    value_of_time: Positive = VALUE_OF_TIME
+    priced_at_s: NotNegative = 34 * HOUR_S
     classes: tuple[str, ...] = ()
-    kwh: float = 0.0
+    kwh: NotNegative = 0.0
     walk_back: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.lot, ParkingLot):
-            raise InputError(f"lot is a {type(self.lot).__name__}, want a ParkingLot")
-        if not isinstance(self.sensor_model, SensorModel):
-            raise InputError(f"sensor_model is a {type(self.sensor_model).__name__}, want a SensorModel")
-        _require_index("goal", self.goal, len(self.lot.goals))
-        if not isinstance(self.tariff, Tariff):
-            raise InputError(f"tariff is a {type(self.tariff).__name__}, want a Tariff")
+        super().__post_init__()
+        require_whole("goal", self.goal, most=len(self.lot.goals) - 1)
         self.tariff.require_zones(self._own_zones, self.lot.name)
-        for name in ("v_drive", "v_walk", "wait_s", "value_of_time"):
-            require_number(name, getattr(self, name), above=0.0)
-        for name in ("failure_s", "give_up_s", "stay_s", "priced_at_s", "kwh"):
-            require_number(name, getattr(self, name), least=0.0)
         object.__setattr__(self, "classes", tuple(self.classes))
         self.class_bits(self.classes)
 
@@ -297,6 +291,14 @@ class SearchProblem:
         """Whether slots in view are observed without error, and nothing is known of others."""
         return self.sensor_model.perfect and not len(self.live_slots)
 
+    @cached_property
+    def live_drive_s(self) -> FloatArray:
+        """Drive from each vertex to each of `live_slots`, (n_live, n_vertices) s."""
+        if not len(self.live_slots):
+            return np.zeros((0, self.lot.n_vertices))
+        metres = dijkstra(self.lot.drive_matrix(timed=True).T.tocsr(), indices=self.live_slots)
+        return _read_only(metres / self.v_drive)
+
     def _counted(self, known: str) -> NDArray[np.int64]:
         """Return the slots of counted facilities of which drivers know so much."""
         facilities = [facility for facility in self.lot.facilities if facility.is_counted]
@@ -382,23 +384,17 @@ class Scenario(SearchProblem):
     name: str
     occupancy: OccupancyModel
     prior: PriorModel | None = None
-    arrival: ArrivalWindow = field(default_factory=ArrivalWindow)
-    demand: Demand | TownDemand | None = None
+    arrival: InstanceOf[ArrivalWindow] = field(default_factory=ArrivalWindow)
+    demand: InstanceOf[Demand] | InstanceOf[TownDemand] | None = None
     entry: int | None = None
-    traffic: Traffic = field(default_factory=Traffic)
+    traffic: InstanceOf[Traffic] = field(default_factory=Traffic)
     rig: str = "laser"
     detector: str = "hog"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.entry is not None:
-            _require_index("entry", self.entry, len(self.lot.entries))
-        if not isinstance(self.traffic, Traffic):
-            raise InputError(f"traffic is a {type(self.traffic).__name__}, want a Traffic")
-        if not isinstance(self.arrival, ArrivalWindow):
-            raise InputError(f"arrival is {self.arrival!r:.60}, want an ArrivalWindow")
-        if not isinstance(self.demand, Demand | TownDemand | None):
-            raise InputError(f"demand is {self.demand!r:.60}, want a Demand, a TownDemand or None")
+            require_whole("entry", self.entry, most=len(self.lot.entries) - 1)
         for name in ("occupancy", "prior"):
             model = getattr(self, name)
             if model is not None and model.n_slots != self.lot.n_slots:
@@ -409,6 +405,17 @@ class Scenario(SearchProblem):
     def public(self) -> SearchProblem:
         """Return the part that agents may know: without the occupancy, its forecast model and the traffic."""
         return SearchProblem(**{f.name: getattr(self, f.name) for f in dataclasses.fields(SearchProblem)})
+
+    @property
+    def arrival_days(self) -> list[ArrivalDay]:
+        """Days on which searches begin, from which each draws one."""
+        return self.occupancy.arrival_days(self.arrival)
+
+    @property
+    def entry_vertices(self) -> IntArray:
+        """Vertices of the entries, from which each search draws one."""
+        vertices = self.lot.entry_vertices
+        return vertices if self.entry is None else vertices[[self.entry]]
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """Return the forecast for a search that starts at the arrival."""
@@ -432,8 +439,3 @@ def drive_metres(lot: ParkingLot, vertex: int | NDArray[np.int64], *, timed: boo
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     array.flags.writeable = False
     return array
-
-
-def _require_index(name: str, value: Any, count: int) -> None:
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or not 0 <= value < count:
-        raise InputError(f"{name} is {value!r}, want an index from 0 to {count - 1}")

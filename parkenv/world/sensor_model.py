@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, require_number, require_one_of
+from parkenv.errors import InputError, require_one_of
+from parkenv.files.field_types import Flag, NotNegative, Probability, Validated
 from parkenv.files.limited_reading import JsonFormat
 
 SENSOR_MODEL_NAMES = ("laser", "stereo")  # rigs with a packaged fitted sensor model
 _FOLDER = Path(__file__).parent / "sensor_models"
-_FORMAT = JsonFormat("parkenv-sensor-model", 1, "a sighting model")
+_FORMAT = JsonFormat("parkenv-sensor-model", 1, "a sensor model")
 
 
 class SensorRates(NamedTuple):
@@ -27,12 +28,11 @@ class SensorRates(NamedTuple):
     false_alarm: FloatArray  # (k,) float64, P(observed taken | free, observed)
 
     def of(self, rows: slice) -> SensorRates:
-        """The rates of some of the slots."""
         return SensorRates(self.seen[rows], self.hit[rows], self.false_alarm[rows])
 
 
 @dataclass(frozen=True)
-class SensorBand:
+class SensorBand(Validated):
     """Sensor rates for slots within some distance, on one side.
 
     Args:
@@ -47,22 +47,19 @@ class SensorBand:
         InputError: a rate outside [0, 1], a negative distance, or uninformative observations (equal rates).
     """
 
-    up_to: float
-    beside: bool
-    seen_rate: float
-    hit_rate: float
-    false_alarm_rate: float
+    up_to: NotNegative
+    beside: Flag
+    seen_rate: Probability
+    hit_rate: Probability
+    false_alarm_rate: Probability
 
     def __post_init__(self) -> None:
-        require_number("up_to", self.up_to, least=0.0)
-        if not isinstance(self.beside, bool):
-            raise InputError(f"beside is {self.beside!r}, want true or false")
-        _require_rates(self.hit_rate, self.false_alarm_rate)
-        require_number("seen_rate", self.seen_rate, least=0.0, most=1.0)
+        super().__post_init__()
+        _require_informative(self.hit_rate, self.false_alarm_rate)
 
 
 @dataclass(frozen=True)
-class SensorModel:
+class SensorModel(Validated):
     """Range and error rates of slot observations from the lane.
 
     Args:
@@ -76,14 +73,14 @@ class SensorModel:
         InputError: a rate outside [0, 1], a negative range, or uninformative observations (equal rates).
     """
 
-    view_range: float = 6.0
-    hit_rate: float = 1.0
-    false_alarm_rate: float = 0.0
+    view_range: NotNegative = 6.0
+    hit_rate: Probability = 1.0
+    false_alarm_rate: Probability = 0.0
     bands: tuple[SensorBand, ...] = ()
 
     def __post_init__(self) -> None:
-        require_number("view_range", self.view_range, least=0.0)
-        _require_rates(self.hit_rate, self.false_alarm_rate)
+        super().__post_init__()
+        _require_informative(self.hit_rate, self.false_alarm_rate)
 
     @classmethod
     def named(cls, name: str) -> Self:
@@ -142,9 +139,7 @@ class SensorModel:
         return rates
 
 
-def _require_rates(hit_rate: float, false_alarm_rate: float) -> None:
-    for name, rate in (("hit_rate", hit_rate), ("false_alarm_rate", false_alarm_rate)):
-        require_number(name, rate, least=0.0, most=1.0)
+def _require_informative(hit_rate: float, false_alarm_rate: float) -> None:
     if hit_rate <= false_alarm_rate:
         raise InputError(
             f"hit_rate {hit_rate} is not above false_alarm_rate {false_alarm_rate}: "

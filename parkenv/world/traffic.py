@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import require_whole
+from parkenv.files.field_types import Validated, Whole
 from parkenv.world.lot import ParkingLot
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _HALF_PERSON = np.array([0.35, 0.3])
 
 
 @dataclass(frozen=True)
-class Traffic:
+class Traffic(Validated):
     """Numbers of road users in a lot besides the searching car.
 
     Traffic does not occupy slots. In the search environments it blocks nothing and is only visible to the sensors. On
@@ -46,24 +46,12 @@ class Traffic:
         InputError: a number below 0.
     """
 
-    cars: int = 0
-    pedestrians: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("cars", "pedestrians"):
-            require_whole(f"Traffic.{name}", getattr(self, name))
+    cars: Whole = 0
+    pedestrians: Whole = 0
 
 
 class LotTraffic:
-    """The traffic of one world: a pure function of (lot, key, time).
-
-    Args:
-        lot: defines the lanes.
-        goal: index of the goal that pedestrians walk to.
-        traffic: numbers of cars and pedestrians.
-        key: key of the world.
-        slots: scene data of the lot; provides the vehicle models.
-    """
+    """The traffic of one world: a pure function of (lot, key, time). `slots` provides the vehicle models."""
 
     def __init__(self, lot: ParkingLot, goal: int, traffic: Traffic, key: np.uint64, slots: SlotLot) -> None:
         self._n_cars, self._n = traffic.cars, traffic.cars + traffic.pedestrians
@@ -79,15 +67,10 @@ class LotTraffic:
         self._looks = np.array([number for _, number in people], dtype=np.int64)
 
     def at(self, time: float, ego: FloatArray | None = None) -> Movers | None:
-        """Return the road users at a time.
+        """Return the road users at a time, s; None without traffic.
 
-        Args:
-            time: s.
-            ego: (3,) x, y in m and yaw in rad of the searching car. Road users in its way are hidden; all others
-                ignore it, so that the world does not depend on the agent.
-
-        Returns:
-            The road users; None without traffic.
+        Those in the way of the searching car at `ego`, (3,) x, y, yaw, are hidden; all others ignore it, so that the
+        world does not depend on the agent.
         """
         if self._n == 0:
             return None
@@ -108,14 +91,7 @@ class LotTraffic:
         return Movers(poses[:n], self._models, poses[n:], stride, self._looks % LOOKS)
 
     def poses_at(self, times: FloatArray) -> FloatArray:
-        """Return the poses of all road users, each at its own time, for traffic that waits.
-
-        Args:
-            times: (cars + pedestrians,) s, cars first.
-
-        Returns:
-            (cars + pedestrians, 3) x, y in m and yaw in rad.
-        """
+        """Return poses, (n, 3) x, y, yaw, of all road users, cars first, each at its own time, s."""
         if self._n == 0:
             return np.empty((0, 3))
         return self._loops.poses(self._loops.stations(times))
@@ -147,7 +123,6 @@ class _Loops:
         self._start = start * self._length
 
     def stations(self, times: FloatArray) -> FloatArray:
-        """Stations on the paths, (n,) m, each at its own time, s."""
         station: FloatArray = (self._start + self._speed * times) % self._length
         return station
 
@@ -163,7 +138,6 @@ class _Loops:
         return np.column_stack([0.5 * (behind + ahead) + self._aside[:, None] * right, yaw])
 
     def _points(self, station: FloatArray) -> FloatArray:
-        """Points on the paths, (n, 2) m."""
         row, s = self._row, station % self._length
         i = np.minimum((self._station <= s[:, None]).sum(axis=1), self._last)
         start, end = self._corners[row, i - 1], self._corners[row, i]
@@ -182,7 +156,6 @@ def _measured(path: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _car(routes: _Routes, rng: np.random.Generator, slots: SlotLot) -> tuple[_Loop, int]:
-    """Draw a drive and a vehicle model."""
     path = routes.round_trip(rng)
     loop = _Loop(path, _AXLE_M, rng.uniform(*CAR_SPEEDS), 0.0, rng.random())
     slot = int(rng.integers(len(slots.fitting)))
@@ -190,7 +163,6 @@ def _car(routes: _Routes, rng: np.random.Generator, slots: SlotLot) -> tuple[_Lo
 
 
 def _person(routes: _Routes, rng: np.random.Generator) -> tuple[_Loop, int]:
-    """Draw a walk and a number for the looks."""
     path = routes.walk(rng)
     loop = _Loop(path, 0.5, rng.uniform(*WALK_SPEEDS), rng.uniform(-0.4, 0.9), rng.random())
     return loop, int(rng.integers(1 << 30))

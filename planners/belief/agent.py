@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.day_belief import DOUBT, EVENT, DayBelief
+from parkenv.belief.day_belief import EVENT, UNINFORMATIVE_SLOT_PROBABILITY, DayBelief
 from parkenv.belief.slot_belief import UNOBSERVED, Observations, SlotBelief
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import require_number
@@ -163,7 +163,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         budget_ms: float = 1.0,
         day: bool = True,
         most_vertices: int = MOST_VERTICES,
-        doubt: float = DOUBT,
+        doubt: float = UNINFORMATIVE_SLOT_PROBABILITY,
         event: float = EVENT,
     ) -> None:
         super().__init__(problem)

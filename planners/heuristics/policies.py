@@ -52,10 +52,10 @@ def decide_by_rule(address: int, number: int) -> int:
     elif not (
         car.settled
         and state == UNOBSERVED
-        and still_leads(data, car.place, car.search, search.vertex, target, moves, car.n_moves)
+        and still_leads(data, car.scenario_index, car.search, search.vertex, target, moves, car.n_moves)
     ):
         car.target, car.n_moves = choose_route(
-            data, car.place, car.search, search.vertex, target, moves, car.n_moves
+            data, car.scenario_index, car.search, search.vertex, target, moves, car.n_moves
         )
         if car.target == NO_SLOT:
             return LEAVE
@@ -76,12 +76,14 @@ def decide_usual(address: int, number: int) -> int:
         n_vertices = streets_at(data, 0).n_slots + streets_at(data, 0).n_junctions
         moves = uint8_array(search.moves, (2 * n_vertices,))
         car.target, car.n_moves, index_s = choose_place(
-            data, car.place, car.search, search.vertex, target, moves, car.n_moves
+            data, car.scenario_index, car.search, search.vertex, target, moves, car.n_moves
         )
         car.expected_s = time + index_s
         if car.target == NO_SLOT:
             return LEAVE
-    if car.n_moves == 0 or takes_slot(data, car.place, car.search, search.vertex, car.expected_s - time):
+    if car.n_moves == 0 or takes_slot(
+        data, car.scenario_index, car.search, search.vertex, car.expected_s - time
+    ):
         return PARK
     car.n_moves -= 1
     return int(uint8s(search.moves)[car.n_moves])

@@ -210,20 +210,20 @@ class Comparison(CaseStudy):
     @cached_property
     def constant_forecasts(self) -> dict[str, tuple[Scenario, float]]:
         """Scenarios with the same forecast for every slot, and its probability, by name."""
-        from parkenv.world.occupancy.constant_map import FlatMap
+        from parkenv.world.occupancy.constant_map import ConstantForecast
 
         made = {}
         for p_occupied in self.grid.constant_forecast:
             for scenario in self._base_scenarios:
                 name = f"{scenario.name}{CONSTANT_FORECAST}{p_occupied:g}"
-                wrong = FlatMap(p_occupied, scenario.prior or scenario.occupancy)
+                wrong = ConstantForecast(p_occupied, scenario.prior or scenario.occupancy)
                 made[name] = (scenario.replace(name=name, prior=wrong), p_occupied)
         return made
 
     @cached_property
     def built(self) -> list[Scenario]:
         """All scenarios, with their own costs and speeds."""
-        from parkenv.scenarios.blind import blind_scenario
+        from parkenv.scenarios.selection import blind_scenario
 
         made = self._base_scenarios + [flat for flat, _ in self.constant_forecasts.values()]
         return (

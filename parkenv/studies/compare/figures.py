@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from parkenv.compiled.arrays import FloatArray
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import UNBEATEN
-from parkenv.scenarios.blind import BLIND
+from parkenv.scenarios.selection import BLIND
 from parkenv.show.columns import SETTING_AXES
 from parkenv.show.figures.picture_files import save_picture
 from parkenv.show.figures.searches import draw_searches

@@ -134,7 +134,7 @@ def simulate_single_driver(
     sums = np.zeros((4, len(cars)))
     cost_s, expected_free = np.empty(len(size)), np.empty(zone.max() + 1)
     for car in range(len(cars)):
-        now, walk_s, walks = hour[car], places.walk_s[cars[car].place], cars[car].walks
+        now, walk_s, walks = hour[car], places.walk_s[cars[car].scenario_index], cars[car].walks
         p, full_now, direct_s = hours.believed[now], hours.full[now], places.entry_drive_s[entry[car]]
         for k in range(len(size)):
             cost = walk_s[k] * walks + zone_cost_s[car, zone[k]] + places.enter_s[k]

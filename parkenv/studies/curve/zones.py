@@ -85,7 +85,10 @@ def day_of_zones(day: Day, zones: Zones, lone: LoneSearches) -> dict[str, Any]:
     n_samples = np.bincount(sampled)
     hour = np.minimum(day.hour_of(cars["arrival"]) - first, len(n_samples) - 1)
     shape = len(zones.names), len(names), len(n_samples)
-    flat, parked = np.ravel_multi_index((cars["place"], purpose[arrives], hour), shape), cars["slot"] >= 0
+    flat, parked = (
+        np.ravel_multi_index((cars["scenario_index"], purpose[arrives], hour), shape),
+        cars["slot"] >= 0,
+    )
     search_s = np.maximum(cars["ended_at"] - cars["arrival"] - day.roads.direct_s(cars), 0.0)
     values = (
         np.ones(len(cars)), parked, cars["failed_parks"], search_s * parked, cars["walk_s"] * parked,

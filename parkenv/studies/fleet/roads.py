@@ -67,8 +67,10 @@ class Roads:
         """
         cars, lot = fleet.cars, self._problem.lot
         rows, free_s = np.searchsorted(self._entries, cars["entry"]), np.zeros((len(cars), len(lot.zones)))
-        for place, walks in sorted({*zip(cars["place"].tolist(), cars["walks"].tolist(), strict=True)}):
-            alike = (cars["place"] == place) & (cars["walks"] == walks)
+        for place, walks in sorted(
+            {*zip(cars["scenario_index"].tolist(), cars["walks"].tolist(), strict=True)}
+        ):
+            alike = (cars["scenario_index"] == place) & (cars["walks"] == walks)
             cost_s = fleet.scenarios[place].walk_s * walks + lot.slot_parking_cost_s
             by_zone = [
                 (self._drive_s[:, lot.zone_of_slot == zone] + cost_s[lot.zone_of_slot == zone]).min(axis=1)

@@ -228,7 +228,7 @@ class Training:
     def open_places(self, env: SearchVecEnv, steps: int) -> None:
         """Let the environments draw from the places that the curriculum has come to."""
         if self.spec.curriculum is not None:
-            env.batch.n_places = open_scenarios(len(self.sides[0]), steps / self.spec.steps)
+            env.batch.n_scenarios = open_scenarios(len(self.sides[0]), steps / self.spec.steps)
 
     def train(
         self, seed: int, folder: Path, shown: Demonstrations | None = None, command: Sequence[str] = ()
@@ -520,7 +520,7 @@ def episode_times(model: Any, places: Scenario | Sequence[Scenario], seeds: Sequ
     k = slots_observed(model.observation_space)
     batch = ParkSearchVectorEnv(n, places, "local", k, MAX_STEPS)
     seen, _ = batch.reset(seed=list(seeds))
-    give_up_s = np.array([scenario.give_up_s for scenario in batch.scenarios])[batch.place_of]
+    give_up_s = np.array([scenario.give_up_s for scenario in batch.scenarios])[batch.scenario_index]
     times, parked = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
     state, start = None, np.ones(n, dtype=np.bool_)
     masked = "action_masks" in model.predict.__code__.co_varnames

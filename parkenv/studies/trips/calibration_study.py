@@ -109,7 +109,7 @@ class CalibrationStudy(Study):
 
     def search(self, slots: str) -> DrivenSearch:
         """Return the trips with or without observations of slots."""
-        from parkenv.scenarios.blind import blind_scenario
+        from parkenv.scenarios.selection import blind_scenario
         from parkenv.studies.trips.driven_search import DrivenSearch
 
         scenario, rig = (self.built, self.rig) if slots == OBSERVED else (blind_scenario(self.built), None)

@@ -13,7 +13,7 @@ from parkenv.driving.collision_world import ObstacleKind, Obstacles
 from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
 from parkenv.driving.parking_task import KINDS, ParkingTasks
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters
-from parkenv.envs.drive_goals import ANGLE_TOLERANCE, POSITION_TOLERANCE
+from parkenv.envs.drive_observation import ANGLE_TOLERANCE, POSITION_TOLERANCE
 from parkenv.errors import InputError
 from parkenv.studies.trips.driven_car import (
     ACROSS,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
+from pydantic import Field
 
 from parkenv.errors import InputError
+from parkenv.files.field_types import NotNegative, Validated
 from parkenv.world.week import DAY_S, HOUR_S
 
 DAY_NAMES = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
@@ -16,7 +18,7 @@ DAY_GROUPS = {"weekdays": (0, 1, 2, 3, 4), "weekend": (5, 6), "all": (0, 1, 2, 3
 
 
 @dataclass(frozen=True)
-class ArrivalWindow:
+class ArrivalWindow(Validated):
     """Weekdays and times of day at which searches begin.
 
     Args:
@@ -26,21 +28,16 @@ class ArrivalWindow:
     """
 
     weekdays: tuple[int, ...] = (0, 1, 2, 3, 4)
-    start_s: float = 8 * HOUR_S
-    end_s: float = 13 * HOUR_S
+    start_s: Annotated[NotNegative, Field(lt=DAY_S)] = 8 * HOUR_S
+    end_s: Annotated[NotNegative, Field(le=DAY_S)] = 13 * HOUR_S
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         days = tuple(self.weekdays)
         if not days or len(set(days)) != len(days) or not set(days) <= set(range(7)):
-            raise InputError(
-                f"ArrivalWindow.weekdays is {days}, want different numbers from 0 (Mon) to 6 (Sun)"
-            )
-        if not 0 <= self.start_s < DAY_S:
-            raise InputError(f"ArrivalWindow.start_s is {self.start_s}, want seconds in [0, 86400)")
-        if not self.start_s <= self.end_s <= DAY_S:
-            raise InputError(
-                f"ArrivalWindow.end_s is {self.end_s}, want seconds in [start_s={self.start_s}, 86400]"
-            )
+            raise InputError(f"weekdays is {days}, want different numbers from 0 (Mon) to 6 (Sun)")
+        if self.end_s < self.start_s:
+            raise InputError(f"end_s is {self.end_s}, want a number of at least start_s, {self.start_s:g}")
         object.__setattr__(self, "weekdays", days)
 
     @classmethod

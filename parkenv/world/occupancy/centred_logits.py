@@ -21,12 +21,7 @@ _LAST_STEP = 1e-7  # Newton's method: the error after a step is of the order of 
 
 
 def centred_logits(p: ArrayLike, deviation: ArrayLike) -> FloatArray:
-    """Return the logits x with E[sigmoid(x + deviation·Z)] = p for a standard normal Z.
-
-    Args:
-        p: probabilities, any shape; infinite logits for 0 and 1.
-        deviation: standard deviations, logits, of a shape that broadcasts with `p`.
-    """
+    """Return the logits x with E[sigmoid(x + deviation·Z)] = p for a standard normal Z; infinite for p = 0 and 1."""
     each = [np.array(a) for a in np.broadcast_arrays(np.asarray(p, float), np.asarray(deviation, float))]
     return np.asarray(_centred_logits(*(a.ravel() for a in each))).reshape(each[0].shape)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from parkenv.errors import require_number
+from parkenv.files.field_types import Probability, Validated
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, MAX_PROBABILITY, MIN_PROBABILITY, PROCESS_KIND
@@ -15,25 +15,21 @@ from parkenv.world.occupancy.process import Arrival, CompiledModel, Forecast, Oc
 
 
 @dataclass(frozen=True, eq=False)
-class FlatMap(PriorModel):
+class ConstantForecast(Validated, PriorModel):
     """A `prior` of a `Scenario` with the same occupancy probability for every slot.
 
     Examples:
         >>> from parkenv import make_scenario
         >>> mini = make_scenario("mini")
-        >>> FlatMap(1.0, mini.occupancy).forecast(Arrival(0.0)).p_occupied[:2].tolist()
+        >>> ConstantForecast(1.0, mini.occupancy).forecast(Arrival(0.0)).p_occupied[:2].tolist()
         [0.999, 0.999]
     """
 
-    p_occupied: float  # the probability, 0 to 1; clipped to the range of forecasts
+    p_occupied: Probability  # the probability, 0 to 1; clipped to the range of forecasts
     true: PriorModel  # provides the decay rates and the day error, which remain correct
-
-    def __post_init__(self) -> None:
-        require_number("p_occupied", self.p_occupied, least=0.0, most=1.0)
 
     @property
     def kind(self) -> int:  # type: ignore[override]
-        """See `PriorModel`: the records of a process say its rates."""
         return PROCESS_KIND if self.true.kind == PROCESS_KIND else EXTERNAL_KIND
 
     def compiled(self, window: ArrivalWindow) -> CompiledModel | None:
@@ -46,18 +42,14 @@ class FlatMap(PriorModel):
 
     @property
     def n_slots(self) -> int:
-        """Number of slots."""
         return self.true.n_slots
 
-    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> FlatMap:
-        """Return this map with the day error, if it is that of an adjustable model."""
+    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> ConstantForecast:
         return replace(self, true=self.true.with_day_error(day_error, walk))
 
-    def for_world(self, world: OccupancyModel) -> FlatMap:
-        """Return this map with the decay rates and the day error of a world."""
+    def for_world(self, world: OccupancyModel) -> ConstantForecast:
         return replace(self, true=world)
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """Forecast the same probability for every slot."""
         p = min(max(self.p_occupied, MIN_PROBABILITY), MAX_PROBABILITY)
         return replace(self.true.forecast(arrival), p_occupied=np.full(self.n_slots, p))

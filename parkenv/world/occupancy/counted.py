@@ -79,11 +79,9 @@ class CountedOccupancy(OccupancyModel):
 
     @property
     def n_slots(self) -> int:
-        """Number of slots of the lot."""
         return int(self.attraction.size)
 
     def days_in(self, window: ArrivalWindow) -> list[str]:
-        """Return the days on the window's weekdays that were counted in all of its hours."""
         first = int(window.start_s // HOUR_S)
         end = max(math.ceil(window.end_s / HOUR_S), first + 1)
         counted = np.flatnonzero(np.isfinite(self.occupied[:, first:end]).all(axis=1))
@@ -96,11 +94,9 @@ class CountedOccupancy(OccupancyModel):
         return days
 
     def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
-        """Return the world of the episode with this key, on the arrival's day."""
         return ProcessWorld(self.process_of(arrival.day), key, arrival)
 
     def process_of(self, day: str) -> OccupancyProcess:
-        """Return the process whose mean occupancy follows the counts of a day."""
         if day not in self._worlds:
             curve = _without_gaps(self.occupied[self._index(day)])
             self._worlds[day] = process_of_curve(self.attraction, curve, self.mean_stay_s)
@@ -153,12 +149,7 @@ def process_of_curve(attraction: FloatArray, curve: FloatArray, mean_stay_s: flo
     """Return the process whose mean occupancy is a given one at the end of every hour of the day, every day.
 
     Within an hour rates are constant. Cars leave after `mean_stay_s` on average, and the arrival rate is chosen for
-    the curve; where the lot empties faster than that, no car arrives and the departure rate is chosen.
-
-    Args:
-        attraction: (n,) float64, logit, popularity of the slots.
-        curve: (24,) float64, mean occupancy at the end of each hour.
-        mean_stay_s: s.
+    the curve, (24,); where the lot empties faster than that, no car arrives and the departure rate is chosen.
     """
     curve = np.clip(curve, LEAST, MOST)
     pull = np.exp(attraction - attraction.max())
@@ -188,6 +179,5 @@ def process_of_curve(attraction: FloatArray, curve: FloatArray, mean_stay_s: flo
 
 
 def _without_gaps(curve: FloatArray) -> FloatArray:
-    """Return a day's curve, (24,), with unknown hours interpolated."""
     known = np.flatnonzero(np.isfinite(curve))
     return np.interp(np.arange(DAY_HOURS), known, curve[known])

@@ -8,19 +8,22 @@ On a day with level L ~ N(0, level²) and slope S ~ N(0, slope²), slot i is tak
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import ConfigDict, Field
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import require_number
+from parkenv.files.field_types import NotNegative, Validated
 
 MAX_LOGITS = 5.0
 """Largest standard deviation of a level or slope; days then are almost empty or almost full."""
+Deviation = Annotated[NotNegative, Field(le=MAX_LOGITS)]
 
 
 @dataclass(frozen=True)
-class DayError:
+class DayError(Validated):
     """Standard deviations over days of a forecast's error, logits.
 
     Args:
@@ -29,17 +32,12 @@ class DayError:
             end; see `nearness`.
     """
 
-    level: float = 0.0
-    slope: float = 0.0
+    __pydantic_config__ = ConfigDict(extra="forbid", strict=False)  # as a table of a scenario file
 
-    def __post_init__(self) -> None:
-        for name in ("level", "slope"):
-            value = getattr(self, name)
-            require_number(f"day_error.{name}", value, least=0.0, most=MAX_LOGITS)
-            object.__setattr__(self, name, float(value))
+    level: Deviation = 0.0
+    slope: Deviation = 0.0
 
     def __bool__(self) -> bool:
-        """Whether days differ from their forecast at all."""
         return self.level > 0.0 or self.slope > 0.0
 
     def deviations(self, nearness: ArrayLike) -> FloatArray:
@@ -52,10 +50,6 @@ EXACT = DayError()
 
 
 def nearness(walk: ArrayLike) -> FloatArray:
-    """Rank slots by their walk to the goal: (n,) from 1, the nearest, to -1, the farthest.
-
-    Args:
-        walk: (n,) walk from each slot to the goal, in any unit.
-    """
+    """Rank slots by their walk to the goal, (n,), in any unit: from 1, the nearest, to -1, the farthest."""
     rank = np.argsort(np.argsort(walk, kind="stable"), kind="stable")
     return np.asarray(1.0 - 2.0 * rank / max(rank.size - 1, 1))

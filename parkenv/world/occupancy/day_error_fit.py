@@ -71,29 +71,24 @@ def _surplus(
 
 def _variance(shift: float, process: OccupancyProcess, moments: FloatArray, count: FloatArray) -> float:
     """Return the variance of the number of observations of taken slots on days with this shift."""
-    p, kept = _day(process, moments, shift)
+    p, remaining = _day(process, moments, shift)
     total, later = 0.0, np.zeros(process.n_slots)
     for k in range(moments.size - 1, -1, -1):
         # Two states of a slot have the covariance p(1 - p) of the earlier one, decayed.
         total += float((count[k] * p[k] * (1.0 - p[k]) * (count[k] + 2.0 * later)).sum())
-        later = kept[k] * (count[k] + later)
+        later = remaining[k] * (count[k] + later)
     return total
 
 
 def _day(process: OccupancyProcess, moments: FloatArray, shift: float) -> tuple[FloatArray, FloatArray]:
     """Follow the slots of a process through a day with exp(`shift`) times its odds and arrival rates.
 
-    Args:
-        process: the process.
-        moments: (k,) float64, s since Monday 00:00, ascending; the day begins with the first.
-        shift: logits.
-
-    Returns:
-        (k, n) float64 each: P(taken), and the part of a difference that is left since the moment before.
+    It begins with the first of `moments`, (k,) s since Monday 00:00, ascending. Returns (k, n) each: P(taken), and the
+    part of a difference that is left since the moment before.
     """
     now = float(moments[0])
     p = expit(logit(np.clip(process.marginal(now), MIN_PROBABILITY, MAX_PROBABILITY)) + shift)
-    found, kept = np.empty((2, moments.size, process.n_slots))
+    taken, remaining = np.empty((2, moments.size, process.n_slots))
     for k, moment in enumerate(moments):
         gathered = np.zeros(process.n_slots)
         while now < moment:
@@ -106,5 +101,5 @@ def _day(process: OccupancyProcess, moments: FloatArray, shift: float) -> tuple[
             p = equilibrium + (p - equilibrium) * np.exp(-total * (until - now))
             gathered += total * (until - now)
             now = until
-        found[k], kept[k] = p, np.exp(-gathered)
-    return found, kept
+        taken[k], remaining[k] = p, np.exp(-gathered)
+    return taken, remaining

@@ -94,10 +94,10 @@ def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple
     flips, watched = np.array([take.sum(), leave.sum()]), n.sum(axis=0) @ gaps
     lowest, highest = np.exp(_LOG_RATE_BOUNDS)
     first = np.log(np.clip(flips / np.maximum(watched, gaps[0]), lowest, highest))
-    found = minimize(
+    optimum = minimize(
         loss, first, jac=True, method="L-BFGS-B", bounds=[_LOG_RATE_BOUNDS] * 2, options={"ftol": 1e-12}
     )
-    arrival, departure = np.exp(found.x)
+    arrival, departure = np.exp(optimum.x)
     return float(arrival), float(departure)
 
 
@@ -181,8 +181,8 @@ def _score(
         arrival = rates[bin_] * rates[at_arrival]
         departure = rates[_N_BINS + bin_] * rates[at_departure]
         total = arrival + departure
-        kept = math.exp(-total * duration)
-        by_total = adjoint * duration * kept * (arrival / total - begun[i])
+        remaining = math.exp(-total * duration)
+        by_total = adjoint * duration * remaining * (arrival / total - begun[i])
         by_share = adjoint * -math.expm1(-total * duration) / (total * total)
         by_arrival = (by_total + by_share * departure) * arrival
         by_departure = (by_total - by_share * arrival) * departure
@@ -192,7 +192,7 @@ def _score(
         score[2 * i + 1] = by_departure
         score[2 * pieces] += by_arrival
         score[2 * pieces + 1] += by_departure
-        adjoint *= kept
+        adjoint *= remaining
     return math.log(seen), 2 * pieces + 2
 
 
@@ -200,10 +200,8 @@ def _score(
 def log_likelihood(theta: FloatArray, intervals: Intervals) -> tuple[float, FloatArray]:
     """Return the log-likelihood of intervals between observations, and its gradient (compiled).
 
-    Args:
-        theta: (96 + 2n,) float64, natural logarithms: arrival profile in 1/s (24 hours of a weekday, 24 of a
-            weekend day), departure profile in the same order, arrival factors (n,), departure factors (n,).
-        intervals: the intervals.
+    `theta`, (96 + 2n,), holds natural logarithms: arrival profile in 1/s (24 hours of a weekday, 24 of a weekend day),
+    departure profile in the same order, arrival factors (n,), departure factors (n,).
     """
     rates = np.exp(theta)
     n = (theta.size - 2 * _N_BINS) // 2

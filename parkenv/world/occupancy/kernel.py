@@ -50,55 +50,44 @@ that a fleet of cars shares. Kinds of forecasts: the first two, and EXTERNAL_KIN
 
 PROCESS = np.dtype(
     [
+        # float64 arrays; a row of the first three is the state before the change.
         ("n_slots", np.int64),
-        ("factors", ADDRESS),
-        ("profiles", ADDRESS),
-        ("hazards", ADDRESS),
-        ("hourly_marginals", ADDRESS),
-        ("centring", ADDRESS),
-        ("nearness", ADDRESS),
-        ("day_error", np.float64, (2,)),
-        ("flat", np.float64),
+        ("factors", ADDRESS),  # (2, n_slots)
+        ("profiles", ADDRESS),  # (2, 168) 1/s
+        ("hazards", ADDRESS),  # (2, 169) integrals of the profiles from Monday 00:00 to full hours
+        ("hourly_marginals", ADDRESS),  # (168, n_slots) P(taken) at full hours; 0 before it is first needed
+        ("centring", ADDRESS),  # see `centring_table`
+        ("nearness", ADDRESS),  # (n_slots,), or no address without one
+        ("day_error", np.float64, (2,)),  # standard deviations over days of level and slope, logits
+        ("flat", np.float64),  # P(taken) of every slot in a `ConstantForecast`; NaN: as the process says
     ],
     align=True,
 )
-"""An `OccupancyProcess`: addresses of its arrays; a row of the first three is the state before the change.
-
-factors (2, n_slots); profiles (2, 168), 1/s; hazards (2, 169), integrals of the profiles from Monday 00:00 to full
-hours; hourly_marginals (168, n_slots), P(taken) at full hours, computed when first needed, 0 before; centring, see
-`centring_table`; nearness (n_slots,), or no address without one. All float64. day_error: standard deviations over days
-of level and slope, logits. flat: P(taken) of every slot in the forecasts of a `FlatMap`; NaN: as the process says.
-"""
+"""An `OccupancyProcess`."""
 
 WORLD_FIELDS = [
     ("key", np.uint64),
-    ("arrival", np.float64),
-    ("hour", np.int64),
+    ("arrival", np.float64),  # s since Monday 00:00
+    ("hour", np.int64),  # of the week, at the arrival
     ("second_of_hour", np.float64),
-    ("day_odds", np.float64),
-    ("day_slope", np.float64),
+    ("day_odds", np.float64),  # the day's level, as a factor of the odds
+    ("day_slope", np.float64),  # logits
 ]
 WORLD = np.dtype(WORLD_FIELDS, align=True)
-"""The world of an episode in a process: its key; the arrival, s since Monday 00:00, the hour of the week and the second
-of that hour; the day's level as a factor of the odds, and its slope, logits. Other records with these fields can be
-used as well.
-"""
+"""The world of an episode in a process. Other records with these fields can be used as well."""
 
 RECORDED_DAY = np.dtype(
     [
-        ("midnight", np.float64),
-        ("record", ADDRESS),
-        ("log_odds", ADDRESS),
-        ("day_level", ADDRESS),
-        ("decay_rate", ADDRESS),
-        ("first", ADDRESS),
-        ("from_s", ADDRESS),
-        ("occupied", ADDRESS),
+        ("midnight", np.float64),  # s since Monday 00:00
+        # Arrays of `MappedLog`, `ReplayForecast` and `OccupancyLog`.
+        *(
+            (name, ADDRESS)
+            for name in ("record", "log_odds", "day_level", "decay_rate", "first", "from_s", "occupied")
+        ),
     ],
     align=True,
 )
-"""A log day replayed on a lot: its midnight, s since Monday 00:00; fields of `MappedLog`,
-`ReplayForecast` and `OccupancyLog`."""
+"""A log day replayed on a lot."""
 
 FUNCTIONS = np.dtype([("data", np.int64), ("state", ADDRESS), ("next_free", ADDRESS)], align=True)
 """A world by the addresses of two functions of (int64 data, int64 slot, float64 time, s): whether the slot is taken,
@@ -106,18 +95,14 @@ FUNCTIONS = np.dtype([("data", np.int64), ("state", ADDRESS), ("next_free", ADDR
 """
 
 CURSOR_FIELDS = [
-    ("sojourn", np.int32),
-    ("since", np.float64),
-    ("valid_until", np.float64),
+    ("sojourn", np.int32),  # number of the sojourn, from 1; 0 before the first query
+    ("since", np.float64),  # its begin, s
+    ("valid_until", np.float64),  # s, the state lasts at least until then
     ("occupied", np.bool_),
-    ("end_known", np.bool_),
+    ("end_known", np.bool_),  # whether it ends exactly then
 ]
 CURSOR = np.dtype(CURSOR_FIELDS, align=True)
-"""The computed part of one slot's true state.
-
-sojourn: number of the sojourn, from 1; 0 before the first query. since: its begin, s. valid_until: s, the state lasts
-at least until then, and ends exactly then if end_known. Other records with these fields can be used as well.
-"""
+"""The computed part of one slot's true state. Other records with these fields can be used as well."""
 
 process_at, world_at = record_at(PROCESS), record_at(WORLD)
 recorded_day_at, cursor_at = record_at(RECORDED_DAY), record_at(CURSOR)
@@ -141,15 +126,9 @@ def begin_day(kind: int, model: int, world: Any) -> None:
 
 @inlined
 def find_state(kind: int, model: int, world: Any, slot: int, cursor: Any, time: float) -> bool:
-    """Return whether a slot is taken, and move its cursor.
+    """Return whether a slot is taken at a time, s, not before its cursor's sojourn began, and move the cursor.
 
-    Args:
-        kind: of the world, one of the first three.
-        model: address of its PROCESS, RECORDED_DAY or FUNCTIONS record.
-        world: a WORLD record.
-        slot: index of the slot.
-        cursor: its cursor, changed in place.
-        time: s, not before the cursor's sojourn began.
+    `model` is the address of the PROCESS, RECORDED_DAY or FUNCTIONS record of the kind, `world` a WORLD record.
     """
     if kind == LOG_KIND:
         return bool(recorded_state(recorded_day_at(model, 0), slot, cursor, time))
@@ -177,7 +156,6 @@ def find_end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, 
 
 @inlined
 def draw_day(process: Any, world: Any) -> None:
-    """Draw the day's level and slope from the world's key."""
     world.day_odds, world.day_slope = 1.0, 0.0
     if has_days(process):
         # Box and Muller: two independent normal numbers from two uniform ones.
@@ -190,7 +168,6 @@ def draw_day(process: Any, world: Any) -> None:
 
 @inlined
 def has_days(process: Any) -> bool:
-    """Return whether days differ from the forecast."""
     return bool(process.day_error[0] > 0.0 or process.day_error[1] > 0.0)
 
 
@@ -223,7 +200,6 @@ def _centring_with_slope(process: Any, slot: int, p: float) -> float:
 
 @inlined
 def _between(table: int, place: float) -> float:
-    """Interpolate in a row of the table."""
     k = min(int(place), TABLE_STEPS - 1)
     low = float64s(table)[k]
     return float(low + (place - k) * (float64s(table)[k + 1] - low))
@@ -231,15 +207,7 @@ def _between(table: int, place: float) -> float:
 
 @kernel
 def process_state(process: Any, world: Any, slot: int, cursor: Any, time: float) -> bool:
-    """Return whether a slot of a process is taken, and move its cursor to the sojourn that holds `time`.
-
-    Args:
-        process: a PROCESS record.
-        world: a WORLD record.
-        slot: index of the slot.
-        cursor: its cursor, changed in place.
-        time: s, not before the cursor's sojourn began.
-    """
+    """Return whether a slot of a process is taken, and move its cursor to the sojourn that holds `time`, s."""
     if cursor.sojourn == 0:
         _enter_first_sojourn(process, world, slot, cursor)
     while time >= cursor.valid_until:
@@ -299,11 +267,7 @@ def find_sojourn_end(process: Any, world: Any, slot: int, cursor: Any) -> None:
 def _time_after(profile: int, hazards: int, since: float, hazard: float) -> float:
     """Return when the hazard of a slot with factor 1, integrated from `since` on, reaches `hazard`.
 
-    Args:
-        profile: address of (168,) rates, 1/s.
-        hazards: address of (169,) sums; the last must be above 0.
-        since: s.
-        hazard: no unit.
+    `profile` is the address of (168,) rates, 1/s, `hazards` that of their (169,) sums, of which the last is above 0.
     """
     rates, sums = float64s(profile), float64s(hazards)
     week, hour, second = hour_of_week(since)
@@ -367,10 +331,9 @@ def _count_below(address: int, begin: int, end: int, value: float, equal_too: bo
 
 @kernel
 def process_law(process: Any, world: Any, slot: int) -> tuple[float, float, float, float, float]:
-    """Return P(taken) of a slot at the arrival, given the day, and the rates of its law.
+    """Return P(taken) of a slot at the arrival, given the day, and the rates of its law, 1/s.
 
-    Returns:
-        That probability; 1/s, rates of arrival in that hour and in the next; rates of departure in both.
+    These are of arrival in that hour and in the next, and of departure in both.
     """
     n, hour = process.n_slots, world.hour
     factors, profiles = float64s(process.factors), float64s(process.profiles)
@@ -384,12 +347,13 @@ def process_law(process: Any, world: Any, slot: int) -> tuple[float, float, floa
     arriving = factors[slot] * profiles[hour] * odds
     arriving_later = factors[slot] * profiles[following] * later_odds
     leaving, leaving_later = profiles[WEEK_HOURS + hour], profiles[WEEK_HOURS + following]
+    departure = factors[n + slot]
     return (
         p * odds / (p * odds + 1.0 - p),
         arriving,
         arriving_later,
-        factors[n + slot] * leaving,
-        factors[n + slot] * leaving_later,
+        departure * leaving,
+        departure * leaving_later,
     )
 
 
@@ -484,14 +448,7 @@ def recorded_index(day: Any, slot: int, second: float) -> int:
 
 @kernel
 def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
-    """Return whether a slot of a recorded day is taken, and move its cursor.
-
-    Args:
-        day: a RECORDED_DAY record.
-        slot: index of the lot's slot.
-        cursor: its cursor, changed in place; sojourns are not counted.
-        time: s since Monday 00:00.
-    """
+    """Return whether a slot of a recorded day is taken at a time, and move its cursor; sojourns are not counted."""
     k = recorded_index(day, slot, time - day.midnight)
     record = int64s(day.record)[slot]
     last = k + 1 >= int64s(day.first)[record + 1]

@@ -165,7 +165,7 @@ class OccupancyLog:
         slots: dict[str, int] = {}
         moments: dict[str, datetime] = {}  # one image shows many slots: many lines have the same text
         latest: dict[str, datetime] = {}
-        found: list[tuple[int, datetime, bool]] = []
+        observations: list[tuple[int, datetime, bool]] = []
         rows = csv_rows(path, MAX_LOG_BYTES)
         at_time, at_slot, at_occupied = csv_columns(path, rows, _KNOWN, ("datetime", "slot_id", "occupied"))
         for line, row in rows:
@@ -183,23 +183,18 @@ class OccupancyLog:
                     f" {latest[slot_id]}; want observations in order of time"
                 )
             latest[slot_id] = moment
-            found.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
-        if not found:
+            observations.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
+        if not observations:
             raise InputError(f"{path}: no observations, want at least one line below the header")
-        dates = [moment.date().isoformat() for _, moment, _ in found]
+        dates = [moment.date().isoformat() for _, moment, _ in observations]
         days = sorted(set(dates))
         day_index = {day: i for i, day in enumerate(days)}
-        seconds = [m.hour * 3600 + m.minute * 60 + m.second + m.microsecond * 1e-6 for _, m, _ in found]
-        return cls(
-            tuple(slots),
-            tuple(days),
-            np.array([slot for slot, _, _ in found], np.int64),
-            np.array([day_index[day] for day in dates], np.int64),
-            np.array(seconds, float),
-            np.array([taken for _, _, taken in found], bool),
-            max_gap_s,
-            str(path),
-        )
+        seconds = [
+            m.hour * 3600 + m.minute * 60 + m.second + m.microsecond * 1e-6 for _, m, _ in observations
+        ]
+        slot, occupied = (np.array([each[k] for each in observations]) for k in (0, 2))
+        day = np.array([day_index[day] for day in dates])
+        return cls(tuple(slots), tuple(days), slot, day, np.array(seconds), occupied, max_gap_s, str(path))
 
     @classmethod
     def read_all(cls, paths: Sequence[str | os.PathLike[str]]) -> Self:
@@ -234,17 +229,15 @@ class OccupancyLog:
         days = sorted({*self.days, *other.days})
         slot = {slot_id: i for i, slot_id in enumerate(self.slot_ids)}
         slots = np.array([slot[slot_id] for slot_id in other.slot_ids], np.int64)
-        mine, theirs = (np.searchsorted(days, log.days) for log in (self, other))
-        return type(self)(
-            self.slot_ids,
-            tuple(days),
-            np.concatenate([self.slot, slots[other.slot]]),
-            np.concatenate([mine[self.day], theirs[other.day]]),
-            np.concatenate([self.second, other.second]),
-            np.concatenate([self.occupied, other.occupied]),
-            self.max_gap_s,
-            f"{self.source},{other.source}",
+        day = [np.searchsorted(days, log.days)[log.day] for log in (self, other)]
+        pairs = (
+            [self.slot, slots[other.slot]],
+            day,
+            [self.second, other.second],
+            [self.occupied, other.occupied],
         )
+        source = f"{self.source},{other.source}"
+        return type(self)(self.slot_ids, tuple(days), *map(np.concatenate, pairs), self.max_gap_s, source)
 
     @cached_property
     def weekend(self) -> BoolArray:
@@ -262,13 +255,9 @@ class OccupancyLog:
         same_record = np.diff(self._record) == 0
         earlier = np.flatnonzero(same_record & (np.diff(self.second) <= max_gap_s))
         later = earlier + 1
+        slot, day = self.slot[earlier], self.day[earlier]
         return Intervals(
-            self.slot[earlier],
-            self.day[earlier],
-            self.second[earlier],
-            self.second[later],
-            self.occupied[earlier],
-            self.occupied[later],
+            slot, day, self.second[earlier], self.second[later], self.occupied[earlier], self.occupied[later]
         )
 
     @cached_property
@@ -279,7 +268,6 @@ class OccupancyLog:
 
     @property
     def _record(self) -> IntArray:
-        """(k,) int64, the record of each observation."""
         return self.day * len(self.slot_ids) + self.slot
 
     def _samples(self, each_s: float) -> Intervals:
@@ -390,7 +378,6 @@ def _sum_periods(
 def csv_columns(
     path: Path, rows: Iterator[tuple[int, list[str]]], known: Sequence[str], needed: Sequence[str]
 ) -> list[int]:
-    """Return the positions of the required columns in the header."""
     _, header = next(rows, (0, []))
     if not header:
         raise InputError(f"{path}: empty, want a header with the columns {', '.join(needed)}")

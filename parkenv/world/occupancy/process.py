@@ -99,6 +99,14 @@ class World(ABC):
         return functions_of(self)
 
 
+def checked_slots(slots: ArrayLike, n: int) -> IntArray:
+    """Return indices of slots, from 0 to n - 1, as an array for compiled code."""
+    slots = np.ascontiguousarray(slots, np.int64)
+    if slots.size and not (slots.min() >= 0 and slots.max() < n):
+        raise IndexError("slot index out of range")
+    return slots
+
+
 class ArrivalDay(NamedTuple):
     """A day on which a search may begin."""
 
@@ -278,45 +286,33 @@ class ProcessWorld(World):
 
     @property
     def address(self) -> int:
-        """Address of the PROCESS record."""
         return self.process.address
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
-        """(k,) bool, whether each of the slots (k,) is taken at `time`, at or after the arrival."""
-        return self._seek(self._checked(slots), time, np.empty(0))
+        return self._seek(checked_slots(slots, self.process.n_slots), time, np.empty(0))
 
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
-        """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
-        slots = self._checked(slots)
+        slots = checked_slots(slots, self.process.n_slots)
         ends = np.empty(slots.size)
         return np.where(self._seek(slots, time, ends), ends, time)
 
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
-        """(k,) int64, number of sojourns (periods of constant state) that each slot has begun since the arrival."""
-        slots = self._checked(slots)
+        slots = checked_slots(slots, self.process.n_slots)
         self._seek(slots, time, np.empty(0))
         begun: IntArray = self._cursors["sojourn"][slots].astype(np.int64)
         return begun
 
     def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
-        """(k,) float64, s: the first time in (`time`, `until`] of another sojourn of each slot; inf if none."""
-        slots = self._checked(slots)
+        slots = checked_slots(slots, self.process.n_slots)
         ends = np.empty(slots.size)
         self._seek(slots, time, ends)
         return np.where(ends <= until, ends, np.inf)
 
     def law(self) -> SlotLaw:
-        """Return the law of the slots, given the day."""
         p_taken, rates = np.empty(len(self._cursors)), np.empty((4, len(self._cursors)))
         _laws(self.process.address, address_of(self._record, kernels.WORLD), p_taken, rates)
         ends = HOUR_S - float(self._record["second_of_hour"][0])
         return SlotLaw(p_taken, rates[:2], rates[2:], ends)
-
-    def _checked(self, slots: ArrayLike) -> IntArray:
-        slots = np.ascontiguousarray(slots, np.int64)
-        if slots.size and not (slots.min() >= 0 and slots.max() < len(self._cursors)):
-            raise IndexError("slot index out of range")
-        return slots
 
     def _seek(self, slots: IntArray, time: float, ends: FloatArray) -> BoolArray:
         arrival = float(self.arrival.time)
@@ -469,7 +465,6 @@ class OccupancyProcess(OccupancyModel):
 
     @property
     def n_slots(self) -> int:
-        """Number of slots."""
         return int(self.factors.shape[1])
 
     @property
@@ -478,10 +473,9 @@ class OccupancyProcess(OccupancyModel):
         return address_of(self.record, kernels.PROCESS)
 
     def compiled(self, window: ArrivalWindow) -> CompiledModel:  # noqa: ARG002 - the same on all days
-        """Return the PROCESS record."""
         tables = {name: getattr(self, name) for name in _TABLES}
-        kept = tuple(array for array in (self._centring, self.nearness) if array is not None)
-        return CompiledModel(self.record, tables, kept)
+        arrays = tuple(array for array in (self._centring, self.nearness) if array is not None)
+        return CompiledModel(self.record, tables, arrays)
 
     def take(self, slots: ArrayLike) -> OccupancyProcess:
         """Return a process whose slot i has the rates of this process's slot `slots[i]`; (n,) int64."""
@@ -544,7 +538,6 @@ class OccupancyProcess(OccupancyModel):
         return marginals
 
     def course(self, arrival: Arrival, times: ArrayLike) -> Course:
-        """Return the expected course of the occupancy, see `OccupancyModel`, in closed form."""
         times = np.asarray(times, np.float64)
         week, second = np.divmod(np.append(times, arrival.time), WEEK_S)
         # The departure rate of a slot with factor 1, integrated over time.

@@ -37,21 +37,19 @@ from parkenv.world.occupancy.kernel import (
     recorded_index,
 )
 from parkenv.world.occupancy.log import OccupancyLog, csv_columns, day_class, weekday_of
-from parkenv.world.occupancy.process import Arrival, CompiledModel, Forecast, OccupancyModel, World
+from parkenv.world.occupancy.process import (
+    Arrival,
+    CompiledModel,
+    Forecast,
+    OccupancyModel,
+    World,
+    checked_slots,
+)
 from parkenv.world.week import DAY_S
 
 
 def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
-    """Read the mapping from the slots of a lot to the slots of a log.
-
-    Args:
-        path: CSV file with the columns `slot_id` (of the lot) and `log_slot_id`, one line per slot.
-        lot_slot_ids: ids of the lot's slots, n.
-        log: the log.
-
-    Returns:
-        (n,) int64, indices into `log.slot_ids`, in the order of `lot_slot_ids`.
-    """
+    """Read the log slot of each slot of a lot, (n,) int64, from a CSV file with `slot_id` and `log_slot_id`."""
     path = Path(path)
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
     lot_index = {slot_id: i for i, slot_id in enumerate(lot_slot_ids)}
@@ -135,15 +133,13 @@ class RecordedWorld(World):
         self._midnight = float(self._day["midnight"][0])
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
-        """(k,) bool, whether each of the slots (k,) is taken at `time`, at or after the arrival."""
-        slots, second = self._checked(slots), self._second(time)
+        slots, second = checked_slots(slots, self._occupancy.n_slots), self._second(time)
         occupied = np.empty(slots.size, np.bool_)
         _occupied(address_of(self._day, RECORDED_DAY), slots, second, occupied)
         return occupied
 
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
-        """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
-        slots, second = self._checked(slots), self._second(time)
+        slots, second = checked_slots(slots, self._occupancy.n_slots), self._second(time)
         free_from = np.empty(slots.size)
         _next_state(
             address_of(self._day, RECORDED_DAY), slots, second, np.zeros(slots.size, np.bool_), free_from
@@ -151,8 +147,7 @@ class RecordedWorld(World):
         return np.maximum(free_from + self._midnight, time)
 
     def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
-        """(k,) float64, s: the first time in (`time`, `until`] of another sojourn of each slot; inf if none."""
-        slots, second = self._checked(slots), self._second(time)
+        slots, second = checked_slots(slots, self._occupancy.n_slots), self._second(time)
         since = np.empty(slots.size)
         _next_state(address_of(self._day, RECORDED_DAY), slots, second, ~self.occupied(slots, time), since)
         changes = since + self._midnight
@@ -162,20 +157,12 @@ class RecordedWorld(World):
         return np.where(changes <= until, changes, np.inf)
 
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
-        """(k,) int64, how often the state of each slot has changed since its first observation of the day."""
-        slots, second = self._checked(slots), self._second(time)
+        slots, second = checked_slots(slots, self._occupancy.n_slots), self._second(time)
         count = np.empty(slots.size, np.int64)
         _changes(address_of(self._day, RECORDED_DAY), slots, second, count)
         return count
 
-    def _checked(self, slots: ArrayLike) -> IntArray:
-        slots = np.ascontiguousarray(slots, np.int64)
-        if slots.size and not (slots.min() >= 0 and slots.max() < self._occupancy.n_slots):
-            raise IndexError("slot index out of range")
-        return slots
-
     def _second(self, time: float) -> float:
-        """Second of the recorded day."""
         if not self.arrival.time <= time < math.inf:
             raise InputError(
                 f"time is {time}, want finite seconds from the arrival at {self.arrival.time} on"
@@ -251,7 +238,6 @@ class RecordedOccupancy(OccupancyModel):
 
     @property
     def n_slots(self) -> int:
-        """Number of slots of the lot."""
         return int(self.walk_m.size)
 
     def with_fixed_slots(self, window: ArrivalWindow) -> RecordedOccupancy:
@@ -269,16 +255,13 @@ class RecordedOccupancy(OccupancyModel):
 
     @property
     def _first(self) -> int:
-        """Index of the first day that can be replayed."""
         first = "" if self.replay_from is None else self.replay_from.isoformat()
         return int(np.searchsorted(self.log.days, first))
 
     def compiled(self, window: ArrivalWindow) -> CompiledModel:
-        """Return a RECORDED_DAY record for each of the days in the window."""
         return CompiledModel(self.day_records(self.days_in(window)), {}, (self,))
 
     def days_in(self, window: ArrivalWindow) -> list[str]:
-        """Return the days to replay on the window's weekdays; InputError if there are none."""
         days = [day for day in self.log.days[self._first :] if weekday_of(day) in window.weekdays]
         if not days:
             names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
@@ -287,7 +270,6 @@ class RecordedOccupancy(OccupancyModel):
         return days
 
     def world(self, key: np.uint64, arrival: Arrival) -> RecordedWorld:  # noqa: ARG002 - the day decides all
-        """Return the replay of the arrival's day."""
         self._second(arrival)
         return RecordedWorld(self, arrival)
 
@@ -312,10 +294,8 @@ class RecordedOccupancy(OccupancyModel):
         for record, day in zip(records, days, strict=True):
             record["midnight"] = weekday_of(day) * DAY_S
             record["record"] = address_of(self.mapped_log(day).record, np.int64)
-            record["first"], record["from_s"] = (
-                address_of(log.first, np.int64),
-                address_of(log.from_s, np.float64),
-            )
+            record["first"] = address_of(log.first, np.int64)
+            record["from_s"] = address_of(log.from_s, np.float64)
             record["occupied"] = address_of(log.occupied, np.bool_)
             if forecast:
                 for name, values in self.day_forecast(day)._asdict().items():
@@ -352,13 +332,7 @@ class RecordedOccupancy(OccupancyModel):
             if held_out.issuperset(days):
                 break
             held_out.update(days)
-        return MappedLog(
-            log_slot,
-            days * len(log.slot_ids) + log_slot,
-            frozenset(held_out),
-            known,
-            days,
-        )
+        return MappedLog(log_slot, days * len(log.slot_ids) + log_slot, frozenset(held_out), known, days)
 
     def day_forecast(self, day: str) -> ReplayForecast:
         """Return the forecast of the lot for the replay of `day`, a day of the log."""
@@ -368,7 +342,6 @@ class RecordedOccupancy(OccupancyModel):
         return self._forecasts[index]
 
     def _known(self, same_class: IntArray, held_out: set[int]) -> IntArray:
-        """Return the days of the class that the forecast and the ranks are made from."""
         log = self.log
         if self.forecast_from == "others":
             known, left = np.setdiff1d(same_class, list(held_out)), "one more"
@@ -389,10 +362,10 @@ class RecordedOccupancy(OccupancyModel):
         nearest = np.sort(known[np.argsort(days_away, kind="stable")[:MAX_DAYS]])
         fitted = log.fitted("slot days", nearest, lambda days: fit_slot_days(log.slot_days(days)))
         replayed, which = np.unique(mapped.replayed, return_inverse=True)
-        found = fitted.forecast(log.dates(replayed))
+        forecast = fitted.forecast(log.dates(replayed))
         share = np.bincount(which) / which.size
-        level = np.sqrt(np.einsum("j,pjk,k->p", share, found.level_covariance, share))
-        p = np.clip(found.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
+        level = np.sqrt(np.einsum("j,pjk,k->p", share, forecast.level_covariance, share))
+        p = np.clip(forecast.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
         return ReplayForecast(np.ascontiguousarray(logit(p)), np.minimum(level, MAX_LOGITS), rates)
 
     def _decay_rates(self, known: IntArray) -> FloatArray:
@@ -402,20 +375,15 @@ class RecordedOccupancy(OccupancyModel):
             raise InputError(
                 f"{self.log.source}: no two consecutive observations on the days that are left to forecast from"
             )
-        return fit_hourly_decay_rates(
-            pairs.start[used], pairs.end[used], pairs.before[used], pairs.after[used]
-        )
+        return fit_hourly_decay_rates(*(part[used] for part in pairs[2:]))
 
     def _assign(self, day: str, known: IntArray) -> IntArray:
-        """Return the log slot of each lot slot by rank, (n,)."""
         n, m = self.n_slots, len(self.log.slot_ids)
         mean = self.log.mean_occupancy(day_class(day), days=np.isin(np.arange(len(self.log.days)), known))
         unknown = np.isnan(mean)
         mean[unknown] = 0.0 if unknown.all() else mean[~unknown].mean()
-        log_slot = np.empty(n, np.int64)
-        log_slot[np.argsort(self.walk_m, kind="stable")] = np.argsort(-mean, kind="stable")[
-            np.arange(n) * m // n
-        ]
+        log_slot, ranks = np.empty(n, np.int64), np.arange(n) * m // n
+        log_slot[np.argsort(self.walk_m, kind="stable")] = np.argsort(-mean, kind="stable")[ranks]
         return log_slot
 
     def _replay_days(self, log_slot: IntArray, replay_order: IntArray) -> IntArray:
@@ -428,10 +396,7 @@ class RecordedOccupancy(OccupancyModel):
             chosen = next(left[int(log_slot[slot])], None)
             if chosen is None:
                 name = self.log.slot_ids[log_slot[slot]]
-                n_copies, n_days = (
-                    int((log_slot == log_slot[slot]).sum()),
-                    int(recorded[log_slot[slot]].sum()),
-                )
+                n_copies, n_days = (log_slot == log_slot[slot]).sum(), recorded[log_slot[slot]].sum()
                 raise InputError(
                     f"{self.log.source}: slot {name} would serve {n_copies} slots of the lot but was recorded"
                     f" on {n_days} days of the class{since}; want a smaller lot or a longer log"

@@ -41,7 +41,6 @@ class SlotLaw(NamedTuple):
         return self.hour_ends_s + HOUR_S
 
     def take(self, slots: IntArray) -> SlotLaw:
-        """Return the law of some slots, (k,)."""
         return SlotLaw(self.p_taken[slots], self.arriving[:, slots], self.leaving[:, slots], self.hour_ends_s)
 
     def p_taken_after(self, seconds: ArrayLike) -> FloatArray:

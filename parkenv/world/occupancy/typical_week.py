@@ -1,14 +1,19 @@
-"""Occupancy of a typical working week on any lot: full by day, empty at night, fuller near the goal."""
+"""Weeks for any lot: a typical working one, and one as counted in real car parks, that of a lot file alone."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import expit, logit
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.forecast.typical_week_fit import LEVEL_SHARES
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.process import OccupancyProcess
+from parkenv.world.occupancy.real_week_figures import FULLER_THAN, LEVELS, OCCUPIED, PULL, UNEVENNESS
+from parkenv.world.week import HOUR_S, WEEK_HOURS
 
 # Logit of the demand in each hour of a weekday; the shape is that of a campus lot: empty at night, full from
 # mid-morning to mid-afternoon.
@@ -19,6 +24,7 @@ _WEEKDAY_DEMAND = np.array(
     ]
 )
 _WEEKEND_DEMAND = np.full(24, -2.5)
+_LEAST_DEMAND, _MOST_DEMAND = -12.0, 30.0  # logits
 _WEEK_DEMAND = np.concatenate([np.tile(_WEEKDAY_DEMAND, 5), np.tile(_WEEKEND_DEMAND, 2)])
 
 
@@ -31,16 +37,11 @@ def typical_occupancy(
     demand: float = 0.0,
     mean_stay_s: float = 2 * 3600.0,
 ) -> OccupancyProcess:
-    """Create an occupancy process for a working week on any lot.
+    """Create an occupancy process for a working week on any lot; `demand` is added at every hour, logits.
 
-    Args:
-        lot: the lot.
-        goal: index of the goal that drivers want to park near.
-        pull: logits by which the demand for the nearest slot is above, and for the farthest below, that of the middle.
-        unevenness: standard deviation, in logits, of the demand for equally near slots. It is drawn from a fixed
-            seed, so the same lot always has the same popular slots.
-        demand: logits added at every hour.
-        mean_stay_s: mean parking duration, s.
+    The demand for the slot nearest to the goal is `pull` logits above, and for the farthest below, that of the middle.
+    Equally near slots differ by `unevenness`, a standard deviation in logits. It is drawn from a fixed seed, so the
+    same lot always has the same popular slots.
     """
     return OccupancyProcess.from_demand(
         attraction(lot, goal, pull, unevenness), _WEEK_DEMAND + demand, mean_stay_s
@@ -77,15 +78,59 @@ def with_full_facilities(process: OccupancyProcess, lot: ParkingLot) -> Occupanc
 def with_event(
     usual: OccupancyProcess, lot: ParkingLot, *, goal: int = 0, share: float, factor: float
 ) -> OccupancyProcess:
-    """Create the process for a day with an event: cars arrive more often at the slots nearest to the goal.
-
-    Args:
-        usual: the process on ordinary days.
-        lot: the lot.
-        goal: index of the goal of the event.
-        share: fraction of the slots, nearest to the goal, that the event fills.
-        factor: factor of their arrival rates.
-    """
+    """Return the process of a day with an event: cars come `factor` times as often to the share nearest to the goal."""
     walk = lot.walk_m(goal)
     near = walk < np.quantile(walk, share)
     return dataclasses.replace(usual, arrival_factor=usual.arrival_factor * np.where(near, factor, 1.0))
+
+
+def real_week_occupancy(
+    lot: ParkingLot,
+    *,
+    goal: int = 0,
+    fuller_than: float = FULLER_THAN,
+    pull: float = PULL,
+    unevenness: float = UNEVENNESS,
+    mean_stay_s: float = 2 * HOUR_S,
+) -> OccupancyProcess:
+    """Create an occupancy process with the week of real car parks: the mean over the slots at full hours is as counted.
+
+    Lot, goal, pull and unevenness as in `typical_occupancy`; `fuller_than` is the share of real car parks that are less
+    full: 0.5 for the typical one, 0.9 for a busy one. Where counts fall faster than parked cars leave, no car arrives.
+
+    Examples:
+        >>> from parkenv.lots import packaged_lot
+        >>> process = real_week_occupancy(packaged_lot("campus"))
+        >>> tuesday_11_am = (24 + 11) * 3600.0
+        >>> round(float(process.marginal(tuesday_11_am).mean()), 3)
+        0.824
+    """
+    popularity = attraction(lot, goal, pull, unevenness)
+    wanted = expit(logit(OCCUPIED / 100.0) + np.interp(fuller_than, LEVEL_SHARES, LEVELS))
+    return OccupancyProcess.from_demand(popularity, _demand(popularity, wanted, mean_stay_s), mean_stay_s)
+
+
+def _demand(popularity: FloatArray, wanted: FloatArray, mean_stay_s: float) -> FloatArray:
+    """Return the demand of each hour, (168,) logits, that brings the mean over the slots to `wanted` at its end."""
+    demand = np.empty(WEEK_HOURS)
+
+    def after(p: FloatArray, logits: float) -> FloatArray:
+        """Follow the slots through an hour of constant rates."""
+        odds = np.exp(popularity + logits)
+        equilibrium = odds / (1.0 + odds)
+        return np.asarray(equilibrium + (p - equilibrium) * np.exp(-(1.0 + odds) * HOUR_S / mean_stay_s))
+
+    p = np.full(popularity.size, wanted[-25])
+    # Start with the last day, then the whole week: the state at the start is forgotten within a day.
+    for hour in (*range(WEEK_HOURS - 24, WEEK_HOURS), *range(WEEK_HOURS)):
+
+        def excess(logits: float, p: FloatArray = p, target: float = wanted[hour]) -> float:
+            return float(after(p, logits).mean()) - target
+
+        demand[hour] = (
+            _LEAST_DEMAND
+            if excess(_LEAST_DEMAND) >= 0.0
+            else brentq(excess, _LEAST_DEMAND, _MOST_DEMAND, xtol=1e-4)
+        )
+        p = after(p, demand[hour])
+    return demand
