@@ -71,7 +71,7 @@ def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[Row]:
     }
     if find_spec("embreex") is not None:
         peers["Embree"] = embree_scanner(plane, laser)
-    exact = np.minimum(laser.scan_batch(plane, poses[:2]), laser.max_range)
+    exact = np.minimum(laser.scan(plane, poses[:2]), laser.max_range)
     for name, peer in peers.items():
         seen = np.minimum(peer(poses[:2]), laser.max_range)
         off = np.abs(seen - exact) > (2 * GRID_CELL if "grid" in name else 2e-3)
@@ -85,9 +85,9 @@ def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[Row]:
         return 1.0 / seconds_each(lambda i: scans(poses[i % 32 : i % 32 + 1]), seconds)
 
     theirs = {name: batch(peer, poses[:16]) for name, peer in peers.items()}
-    exact_batch = batch(lambda poses: laser.scan_batch(plane, poses), poses)
+    exact_batch = batch(lambda poses: laser.scan(plane, poses), poses)
     rows = rate("laser", "200 cars, 256 at once", exact_batch, "scans/s", **theirs)
-    noisy_batch = batch(lambda poses: laser.scan_batch(plane, poses, rng), poses)
+    noisy_batch = batch(lambda poses: laser.scan(plane, poses, rng), poses)
     rows += rate("laser", "200 cars, 256 at once, noise", noisy_batch, "scans/s", **theirs)
 
     theirs = {name: singly(peer) for name, peer in peers.items()}
@@ -97,7 +97,7 @@ def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[Row]:
     rows += rate("laser", "200 cars, one by one, noise", noisy_one, "scans/s", **theirs)
 
     large, draw = walled_lot(np.random.default_rng(seed), 10_000, columns=177)
-    large_batch = batch(lambda poses: laser.scan_batch(large, poses), draw(256))
+    large_batch = batch(lambda poses: laser.scan(large, poses), draw(256))
     smaller = {"itself at 200 cars": exact_batch}
     return rows + rate("laser", "10,000 cars, 256 at once", large_batch, "scans/s", **smaller)
 

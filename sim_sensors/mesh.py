@@ -4,31 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array
 
-
-class Material(IntEnum):
-    """Materials, each with its own shading."""
-
-    PAINT = 0  # clear-coated, glossy
-    GLASS = 1  # transparent, with reflections
-    TRIM = 2  # dark plastic
-    RUBBER = 3
-    RIM = 4
-    LAMP = 5
-    PLATE = 6
-    INTERIOR = 7  # seats and dashboard behind glass
-    CHROME = 8
-    FACADE = 9
-    FOLIAGE = 10
-    BARK = 11
-    STONE = 12  # kerbs, walls
-    POST = 13
-    CLOTH = 14  # pedestrians
+Material = IntEnum(
+    "Material",
+    "PAINT GLASS TRIM RUBBER RIM LAMP PLATE INTERIOR CHROME FACADE FOLIAGE BARK STONE POST CLOTH",
+    start=0,
+)
+"""Materials, each with its own shading: clear-coated paint, glass, dark plastic (trim), rubber, ... the stone of kerbs
+and walls, and the cloth of pedestrians. An interior is seats and dashboard behind glass."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,18 +32,8 @@ class Mesh:
     color: NDArray[np.uint8]  # (t, 3) uint8, sRGB albedo
 
 
-@dataclass(frozen=True, eq=False)
-class MeshPool:
-    """Many meshes in shared arrays, for compiled code.
-
-    Attributes:
-        vertices, normals, triangles, material, color: as in `Mesh`, one mesh after the other; indices in `triangles`
-            count from the start of their mesh.
-        vertex_start: (n_meshes + 1,) int64; mesh m has vertices `vertex_start[m]:vertex_start[m + 1]`.
-        triangle_start: (n_meshes + 1,) int64, the same for triangles.
-        radius: (n_meshes,) float32, m, radius of a sphere around the mesh's origin that contains it, for culling.
-        coarse: (n_meshes,) int32, the mesh drawn instead when it is far away; None: always itself.
-    """
+class MeshArrays(NamedTuple):
+    """The arrays of a pool for compiled code."""
 
     vertices: Float32Array
     normals: Float32Array
@@ -62,8 +42,27 @@ class MeshPool:
     color: NDArray[np.uint8]
     vertex_start: NDArray[np.int64]
     triangle_start: NDArray[np.int64]
-    radius: Float32Array
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPool:
+    """Many meshes in shared arrays: as in `Mesh`, one after the other."""
+
+    vertices: Float32Array
+    normals: Float32Array
+    triangles: NDArray[np.int32]  # indices count from the start of their mesh
+    material: NDArray[np.uint8]
+    color: NDArray[np.uint8]
+    # (n_meshes + 1,) mesh m has vertices `vertex_start[m]:vertex_start[m + 1]`, and triangles likewise
+    vertex_start: NDArray[np.int64]
+    triangle_start: NDArray[np.int64]
+    radius: Float32Array  # (n_meshes,) m, of a sphere around the mesh's origin that contains it, for culling
+    # (n_meshes,) the mesh drawn instead when it is far away; None: always itself
     coarse: NDArray[np.int32] | None = None
+
+    @cached_property
+    def arrays(self) -> MeshArrays:
+        return MeshArrays(*(getattr(self, name) for name in MeshArrays._fields))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, as_floats, as_integers
 from sim_sensors.mesh import Mesh
 from sim_sensors.scenery import GAITS, pedestrian_mesh
-from sim_sensors.surroundings import floats
 
 LOOKS = 12  # number of different pedestrians
 
@@ -32,31 +31,23 @@ class Movers:
 
     def __post_init__(self) -> None:
         for name, rows in (("vehicle_pose", "vehicle_model"), ("walker_pose", "walker_look")):
-            pose = floats(name, getattr(self, name), 3)
-            object.__setattr__(self, name, pose)
-            numbers = np.array(getattr(self, rows), dtype=np.int64)
-            if numbers.shape != (len(pose),) or numbers.min(initial=0) < 0:
-                raise SensorError(f"{rows} is {numbers.tolist()}, want ({len(pose)},) integers of 0 or more")
+            object.__setattr__(self, name, as_floats(name, getattr(self, name), None, 3))
+            numbers = as_integers(rows, np.asarray(getattr(self, rows)), len(getattr(self, name)), least=0)
             object.__setattr__(self, rows, numbers)
-        stride = floats("walker_stride", np.reshape(self.walker_stride, (-1, 1)), 1)[:, 0]
-        if len(stride) != self.n_walkers:
-            raise SensorError(f"walker_stride has {len(stride)} phases, want {self.n_walkers}")
+        stride = as_floats("walker_stride", self.walker_stride, self.n_walkers)
         object.__setattr__(self, "walker_stride", stride)
         if self.walker_look.max(initial=0) >= LOOKS:
             raise SensorError(f"walker_look is {self.walker_look.tolist()}, want 0 to {LOOKS - 1}")
 
     @property
     def n_vehicles(self) -> int:
-        """Number of moving vehicles."""
         return len(self.vehicle_pose)
 
     @property
     def n_walkers(self) -> int:
-        """Number of pedestrians."""
         return len(self.walker_pose)
 
     def only(self, vehicles: NDArray[np.bool_], walkers: NDArray[np.bool_]) -> Movers:
-        """Return those that the masks, (m,) and (p,), select."""
         return Movers(
             self.vehicle_pose[vehicles],
             self.vehicle_model[vehicles],
@@ -73,5 +64,4 @@ class Movers:
 
 @lru_cache(maxsize=1)
 def people_meshes() -> tuple[Mesh, ...]:
-    """Return the mesh of every pedestrian in every gait, `GAITS` for each appearance."""
     return tuple(pedestrian_mesh(gait / GAITS, look) for look in range(LOOKS) for gait in range(GAITS))

@@ -237,13 +237,7 @@ class SensorRig:
         return Capture(vehicle, images, pairs, scans)
 
     def prepare(self, scene: Sensed, pose: FloatArray, weather: Weather | None = None) -> None:
-        """Draw what captures near a pose share: sky, shadows, scan plane. Captures in several threads then read it.
-
-        Args:
-            scene: as in `capture`.
-            pose: as in `capture`.
-            weather: as in `capture`.
-        """
+        """Draw what captures near a pose share: sky, shadows, scan plane. Captures in several threads then read it."""
         for _, camera, mount in self.cameras:
             camera.prepare(scene, mount.camera_pose(pose), weather)
         for _, stereo, mount in self.stereo_cameras:

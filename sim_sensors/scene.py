@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, as_floats, as_integers
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.mesh import Ground, Instances, Mesh, MeshPool
 from sim_sensors.movers import LOOKS, Movers, people_meshes
 from sim_sensors.scenery import GAITS, pedestrian_footprint
-from sim_sensors.surroundings import Surroundings, floats
+from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import COARSE, DETAILED, FOOTPRINT_CORNERS, VehicleModel
 
 NO_VEHICLE = -1
@@ -29,8 +29,6 @@ class OverlapWarning(UserWarning):
 
 
 class Footprints(NamedTuple):
-    """The obstacles in a horizontal plane 0.5 m above the ground, for `footprints.ScanPlane`."""
-
     # (n, k, 2) float64, m, world frame, counter-clockwise: a row for every vehicle place, then the posts, trunks and
     # people of the surroundings, then moving objects
     corners: FloatArray
@@ -44,10 +42,6 @@ class Fleet:
     """The meshes of a scene: its surroundings, and every vehicle model with its coarse version.
 
     Scenes that differ only in the poses of these vehicles share it.
-
-    Args:
-        models: the vehicle models.
-        surroundings: ground and scenery.
     """
 
     def __init__(self, models: Sequence[VehicleModel], surroundings: Surroundings) -> None:
@@ -62,9 +56,12 @@ class Fleet:
             larger.__dict__["pool"] = _joined(self.pool, pair)
         return larger
 
+    def require_models(self, model: IntArray) -> None:
+        if model.max(initial=NO_VEHICLE) >= len(self.models):
+            raise SensorError(f"vehicle_model is {model.tolist()}, want at most {len(self.models) - 1}")
+
     @cached_property
     def _scenery(self) -> tuple[list[Mesh], list[int]]:
-        """Return the distinct meshes of the surroundings, and the index of each object's mesh."""
         meshes: list[Mesh] = []
         place: dict[int, int] = {}
         index = []
@@ -85,16 +82,13 @@ class Fleet:
         return _joined(None, meshes, scenery=before)
 
     def mesh_of(self, model: IntArray) -> NDArray[np.int32]:
-        """Return the index in the pool of the detailed mesh of each model."""
         return (len(self._scenery[0]) + LOOKS * GAITS + 2 * model).astype(np.int32)
 
     def mesh_of_walkers(self, movers: Movers) -> NDArray[np.int32]:
-        """Return the index in the pool of each pedestrian's mesh."""
         return (len(self._scenery[0]) + GAITS * movers.walker_look + movers.gait).astype(np.int32)
 
     @cached_property
     def scenery_instances(self) -> Instances:
-        """All instances except the vehicles."""
         things = self.surroundings.standing
         pose = np.zeros((len(things), 4))
         if things:
@@ -115,10 +109,8 @@ class Fleet:
 
     @cached_property
     def posts(self) -> tuple[FloatArray, IntArray]:
-        """The footprints of the surroundings, world frame, as in `outlines`."""
-        return _padded(
-            [_moved(t.footprint, t.pose) for t in self.surroundings.standing if t.footprint is not None]
-        )
+        shapes = [(t.footprint, np.array([t.pose])) for t in self.surroundings.standing]
+        return _padded([_placed(shape, pose)[0] for shape, pose in shapes if shape is not None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,21 +143,15 @@ class Scene:
     movers: Movers | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        pose = floats("vehicle_pose", self.vehicle_pose, 3)
-        model = np.array(self.vehicle_model, dtype=np.int64)
-        if model.shape != (len(pose),):
-            raise SensorError(f"vehicle_model has shape {model.shape}, want ({len(pose)},)")
-        if len(model) and not (model.min() >= NO_VEHICLE and model.max() < len(self.fleet.models)):
-            raise SensorError(f"vehicle_model is {model.tolist()}, want -1 to {len(self.fleet.models) - 1}")
+        pose = as_floats("vehicle_pose", self.vehicle_pose, None, 3)
+        model = as_integers("vehicle_model", self.vehicle_model, len(pose), least=NO_VEHICLE)
+        self.fleet.require_models(model)
         self._set(pose, model, self.fleet)
         pairs = overlapping(pose[self.present], self.fleet.sizes[model[self.present]])
         if len(pairs):
             first, second = self.present[pairs[0]]
-            warnings.warn(
-                f"vehicles {first} and {second} overlap ({len(pairs)} such pairs)",
-                OverlapWarning,
-                stacklevel=3,
-            )
+            text = f"vehicles {first} and {second} overlap ({len(pairs)} such pairs)"
+            warnings.warn(text, OverlapWarning, stacklevel=3)
 
     def _set(self, pose: FloatArray, model: IntArray, fleet: Fleet, movers: Movers | None = None) -> None:
         for array in (pose, model):
@@ -195,10 +181,8 @@ class Scene:
         Raises:
             SensorError: as for the class, or the lengths differ.
         """
-        pose = floats("poses", poses, 3)
-        seed = np.asarray(seeds)
-        if seed.shape != (len(pose),) or (len(pose) and not np.issubdtype(seed.dtype, np.integer)):
-            raise SensorError(f"seeds has shape {seed.shape} of {seed.dtype}, want ({len(pose)},) integers")
+        pose = as_floats("poses", poses, None, 3)
+        seed = as_integers("seeds", seeds, len(pose))
         models: dict[VehicleModel, int] = {}
         index = []
         for name, column in (("bodies", bodies), ("paints", paints)):
@@ -366,12 +350,10 @@ class Scene:
         Raises:
             SensorError: the fleet does not have a model.
         """
-        if movers is not None and movers.vehicle_model.max(initial=0) >= len(self.fleet.models):
-            raise SensorError(
-                f"vehicle_model is {movers.vehicle_model.tolist()}, want 0 to {len(self.fleet.models) - 1}"
-            )
         if movers is self.movers:
             return self
+        if movers is not None:
+            self.fleet.require_models(movers.vehicle_model)
         scene = object.__new__(Scene)
         scene._set(self.vehicle_pose, self.vehicle_model, self.fleet, movers)
         scene.__dict__["still_instances"] = self.still_instances
@@ -383,7 +365,7 @@ class Scene:
 
     def _changed(self, i: int, pose: ArrayLike, number: int, fleet: Fleet) -> Scene:
         new_pose, new_model = self.vehicle_pose.copy(), self.vehicle_model.copy()
-        new_pose[i] = floats("pose", np.asarray(pose, dtype=np.float64)[None], 3)[0]
+        new_pose[i] = as_floats("pose", pose, 3)
         new_model[i] = number
         scene = object.__new__(Scene)
         scene._set(new_pose, new_model, fleet, self.movers)
@@ -402,15 +384,7 @@ class Scene:
 
 
 def overlapping(pose: FloatArray, size: FloatArray) -> IntArray:
-    """Return the pairs of vehicles whose rectangles overlap.
-
-    Args:
-        pose: (n, 3) x, y in m, yaw in rad.
-        size: (n, 3) m, length, width, height.
-
-    Returns:
-        (k, 2) int64, first < second, ascending.
-    """
+    """Return the pairs of vehicles whose rectangles, (n, 3) poses and sizes, overlap: (k, 2) int64, ascending."""
     if len(pose) < 2:
         return np.empty((0, 2), dtype=np.int64)
     reach = float(np.hypot(size[:, 0], size[:, 1]).max())
@@ -420,7 +394,6 @@ def overlapping(pose: FloatArray, size: FloatArray) -> IntArray:
 
 
 def _rectangles_meet(pose: FloatArray, size: FloatArray) -> bool:
-    """Return whether two rectangles, (2, 3) poses and sizes, overlap (separating axis test)."""
     axis = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
     axes = np.concatenate([axis, np.stack([-axis[:, 1], axis[:, 0]], axis=-1)])
     across = np.stack([-axis[:, 1], axis[:, 0]], axis=-1)
@@ -431,12 +404,7 @@ def _rectangles_meet(pose: FloatArray, size: FloatArray) -> bool:
     return bool((np.abs(axes @ (pose[1, :2] - pose[0, :2])) < reach).all())
 
 
-def _moved(outline: FloatArray, pose: tuple[float, float, float]) -> FloatArray:
-    return np.asarray(_placed(outline[None], np.array([pose]))[0])
-
-
 def _placed(outline: FloatArray, pose: FloatArray) -> FloatArray:
-    """Transform (n, k, 2) outlines by (n, 3) poses."""
     c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
     x = c * outline[..., 0] - s * outline[..., 1] + pose[:, 0, None]
     y = s * outline[..., 0] + c * outline[..., 1] + pose[:, 1, None]
@@ -456,26 +424,22 @@ def _joined(pool: MeshPool | None, meshes: Sequence[Mesh], scenery: int = 0) -> 
     parts: list[Mesh | MeshPool] = [*([] if pool is None else [pool]), *meshes]
     if not parts:
         parts = [_NOTHING]
+    vertex_start, triangle_start = (
+        np.zeros(1, np.int64) if pool is None else getattr(pool, f"{name}_start")
+        for name in ("vertex", "triangle")
+    )
     vertices = np.array([len(m.vertices) for m in meshes], dtype=np.int64)
     triangles = np.array([len(m.triangles) for m in meshes], dtype=np.int64)
-    before = (
-        (np.zeros(1, np.int64), np.zeros(1, np.int64))
-        if pool is None
-        else (pool.vertex_start, pool.triangle_start)
-    )
     radius = [float(np.sqrt((m.vertices.astype(np.float64) ** 2).sum(axis=1).max())) for m in meshes]
     coarse = np.arange(start, start + len(meshes), dtype=np.int32)
     coarse[scenery::2] += 1
+    shared = ("vertices", "normals", "triangles", "material", "color")
     return MeshPool(
-        np.concatenate([p.vertices for p in parts]),
-        np.concatenate([p.normals for p in parts]),
-        np.concatenate([p.triangles for p in parts]),
-        np.concatenate([p.material for p in parts]),
-        np.concatenate([p.color for p in parts]),
-        np.concatenate([before[0], before[0][-1] + np.cumsum(vertices)]),
-        np.concatenate([before[1], before[1][-1] + np.cumsum(triangles)]),
-        np.concatenate([np.empty(0) if pool is None else pool.radius, radius]).astype(np.float32),
-        coarse if pool is None or pool.coarse is None else np.concatenate([pool.coarse, coarse]),
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in shared},
+        vertex_start=np.concatenate([vertex_start, vertex_start[-1] + np.cumsum(vertices)]),
+        triangle_start=np.concatenate([triangle_start, triangle_start[-1] + np.cumsum(triangles)]),
+        radius=np.concatenate([np.empty(0) if pool is None else pool.radius, radius]).astype(np.float32),
+        coarse=coarse if pool is None or pool.coarse is None else np.concatenate([pool.coarse, coarse]),
     )
 
 

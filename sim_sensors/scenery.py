@@ -24,52 +24,24 @@ _REVEAL = 0.14  # m, depth of the window in the wall
 _STEP = 0.76  # m, length of a walking step
 
 
-class _Part(IntEnum):
-    WALL = 0
-    PLINTH = 1
-    FRAME = 2
-    GLASS = 3
-    ROOM = 4
-    DOOR = 5
-    ROOF = 6
-    BARK = 7
-    LEAVES = 8
-    LEAVES_DARK = 9
-    POST = 10
-    LANTERN = 11
-    STONE = 12
-    COPING = 13
-    SKIN = 14
-    HAIR = 15
-    COAT = 16
-    TROUSERS = 17
-    SHOES = 18
-
-
-_MATERIAL = np.array(
-    [
-        Material.STONE,
-        Material.STONE,
-        Material.TRIM,
-        Material.GLASS,
-        Material.INTERIOR,
-        Material.TRIM,
-        Material.STONE,
-        Material.BARK,
-        Material.FOLIAGE,
-        Material.FOLIAGE,
-        Material.POST,
-        Material.LAMP,
-        Material.STONE,
-        Material.STONE,
-        Material.CLOTH,
-        Material.CLOTH,
-        Material.CLOTH,
-        Material.CLOTH,
-        Material.CLOTH,
-    ],
-    dtype=np.uint8,
+_Part = IntEnum(
+    "_Part",
+    "WALL PLINTH FRAME GLASS ROOM DOOR ROOF BARK LEAVES LEAVES_DARK POST LANTERN STONE COPING SKIN HAIR COAT TROUSERS "
+    "SHOES",
+    start=0,
 )
+_MATERIAL = np.full(len(_Part), Material.STONE, dtype=np.uint8)
+for _material, _parts in {
+    Material.TRIM: (_Part.FRAME, _Part.DOOR),
+    Material.GLASS: (_Part.GLASS,),
+    Material.INTERIOR: (_Part.ROOM,),
+    Material.BARK: (_Part.BARK,),
+    Material.FOLIAGE: (_Part.LEAVES, _Part.LEAVES_DARK),
+    Material.POST: (_Part.POST,),
+    Material.LAMP: (_Part.LANTERN,),
+    Material.CLOTH: (_Part.SKIN, _Part.HAIR, _Part.COAT, _Part.TROUSERS, _Part.SHOES),
+}.items():
+    _MATERIAL[list(_parts)] = _material
 
 
 def _made(build: ShapeBuilder, colors: dict[_Part, ArrayLike]) -> Mesh:
@@ -80,15 +52,9 @@ def _made(build: ShapeBuilder, colors: dict[_Part, ArrayLike]) -> Mesh:
 
 
 def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
-    """Make a building with storeys of recessed windows, doors, a plinth and a cornice.
+    """Make a building with storeys of recessed windows, doors, a plinth and a cornice, in the frame of its outline.
 
-    Args:
-        outline: (k, 2) m, a simple polygon, counter-clockwise.
-        height: m, at least 2.4.
-        seed: seed of colours and doors.
-
-    Returns:
-        The mesh in the outline's frame; it has no interior and no roof.
+    That is a simple polygon, (k, 2) m, counter-clockwise; the height is at least 2.4 m.
     """
     corner = np.asarray(outline, dtype=np.float64)
     rng = np.random.default_rng([seed, 11])
@@ -116,14 +82,10 @@ def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
 
 
 class _Facade(NamedTuple):
-    """One side of a building; its outside is on the right of its direction."""
-
     start: FloatArray
     along: FloatArray
-    length: float
 
     def place(self, u: FloatArray, z: FloatArray, depth: FloatArray) -> FloatArray:
-        """Return the points at u along the wall, height z and `depth` outwards, m."""
         out = np.array([self.along[1], -self.along[0]])
         base = self.start + u[..., None] * self.along + depth[..., None] * out
         return np.concatenate([base, z[..., None]], axis=-1)
@@ -145,7 +107,7 @@ def _add_facade(
     build: ShapeBuilder, start: FloatArray, end: FloatArray, height: float, rng: np.random.Generator
 ) -> None:
     length = float(np.hypot(*(end - start)))
-    facade = _Facade(start, (end - start) / length, length)
+    facade = _Facade(start, (end - start) / length)
     bays, storeys = int((length - 0.8) / _BAY), max(1, round((height - 0.5) / _STOREY))
     tall, pitch = (height - 0.5) / storeys, length / max(bays, 1)
     centers = (np.arange(bays) + 0.5) * pitch
@@ -183,7 +145,6 @@ def _add_window(build: ShapeBuilder, facade: _Facade, box: tuple[float, float, f
 
 
 def _ears(corner: FloatArray) -> list[tuple[int, int, int]]:
-    """Triangulate a simple counter-clockwise polygon by ear clipping."""
     left = list(range(len(corner)))
     triangles = []
     while len(left) > 3:
@@ -220,7 +181,6 @@ def wall_mesh(start: ArrayLike, end: ArrayLike, height: float, thickness: float,
 
 
 def kerb_mesh(line: ArrayLike) -> Mesh:
-    """Make kerb stones along a polyline, (k, 2) m."""
     point = np.asarray(line, dtype=np.float64)
     build = ShapeBuilder()
     for a, b in itertools.pairwise(point):
@@ -241,7 +201,6 @@ def _add_bar(
 
 
 def tree_mesh(height: float, seed: int) -> Mesh:
-    """Make a broad-leaved tree on the z axis; height in m."""
     rng = np.random.default_rng([seed, 13])
     build = ShapeBuilder()
     scale = height / 7.0
@@ -270,7 +229,6 @@ def _add_ball(
     rng: np.random.Generator | None = None,
     rough: float = 0.0,
 ) -> None:
-    """Add an ellipsoid of 8 × 5 facets with an optional rough surface."""
     across, up = np.linspace(0, 2 * np.pi, 9), np.linspace(-np.pi / 2, np.pi / 2, 6)
     reach = np.ones((9, 6))
     if rng is not None:
@@ -290,7 +248,6 @@ def _add_ball(
 
 
 def lamp_post_mesh(height: float = 5.5) -> Mesh:
-    """Make a lamp post at the origin with its arm along x; height in m."""
     build = ShapeBuilder()
     foot, neck = LAMP_POST_M, 0.55 * LAMP_POST_M
     build.turned(
@@ -306,12 +263,7 @@ GAITS = 8  # number of phases of a stride for which meshes are shared
 
 
 def pedestrian_mesh(phase: float, seed: int) -> Mesh:
-    """Make a walking pedestrian at the origin, facing along x.
-
-    Args:
-        phase: phase of the stride, in turns; the step is widest at 0 and 0.5.
-        seed: seed of height and clothes.
-    """
+    """Make a walking pedestrian at the origin, facing along x; the step is widest at phases, in turns, of 0 and 0.5."""
     rng = np.random.default_rng([seed, 14])
     scale = rng.uniform(1.58, 1.88) / 1.75
     build = ShapeBuilder()
@@ -363,7 +315,6 @@ def pedestrian_mesh(phase: float, seed: int) -> Mesh:
 def _add_limb(
     build: ShapeBuilder, a: FloatArray, b: FloatArray, radius: tuple[float, float], part: _Part
 ) -> None:
-    """Add a tapered rod with seven sides from a to b, closed at both ends."""
     axis = (b - a) / np.linalg.norm(b - a)
     side = np.cross(axis, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, as_floats, as_integers, require_seed
 from sim_sensors.scene import NO_VEHICLE, Fleet, Scene
-from sim_sensors.surroundings import Surroundings, floats
+from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
 
 LINE_M = 0.10  # width of painted slot lines
@@ -88,22 +88,19 @@ class SlotLot:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        xy = floats("slot_xy", self.slot_xy, 2)
+        xy = as_floats("slot_xy", self.slot_xy, None, 2)
         n = len(xy)
         object.__setattr__(self, "slot_xy", xy)
         for name in ("slot_yaw", "slot_length", "slot_width"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape not in ((), (n,)):
-                raise SensorError(f"{name} has shape {value.shape}, want ({n},)")
-            column = floats(name, np.broadcast_to(value, (n,)).reshape(-1, 1), 1)[:, 0]
+            value = np.asarray(getattr(self, name))
+            column = as_floats(name, np.broadcast_to(value, (n,)) if value.ndim == 0 else value, n)
             if name != "slot_yaw" and (column <= 0).any():
                 raise SensorError(f"{name} is {column.min()}, want lengths above 0 m")
             object.__setattr__(self, name, column)
         if np.asarray(self.kerbside).shape not in ((), (n,)):
             raise SensorError(f"kerbside has shape {np.asarray(self.kerbside).shape}, want ({n},)")
         object.__setattr__(self, "kerbside", np.broadcast_to(np.asarray(self.kerbside, dtype=bool), (n,)))
-        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
-            raise SensorError(f"seed is {self.seed!r}, want an integer, 0 or more")
+        require_seed(self.seed)
         if self.n_models < 1:
             raise SensorError(f"n_models is {self.n_models}, want 1 or more")
         if self.surroundings is None:
@@ -178,13 +175,9 @@ class SlotLot:
         if taken.shape != (n,) or taken.dtype != bool:
             raise SensorError(f"occupied has shape {taken.shape} of {taken.dtype}, want ({n},) bool")
         number = np.asarray(arrivals)
-        if (
-            number.shape not in ((), (n,))
-            or not np.issubdtype(number.dtype, np.integer)
-            or (number < 0).any()
-        ):
-            raise SensorError(f"arrivals is {arrivals!r}, want ({n},) integers of 0 or more")
-        number = np.broadcast_to(number, (n,))
+        number = as_integers(
+            "arrivals", np.broadcast_to(number, (n,)) if number.ndim == 0 else number, n, least=0
+        )
         pose = np.column_stack([self._column("slot_xy"), self._column("slot_yaw")])
         model = np.full(n, NO_VEHICLE, dtype=np.int64)
         for slot in np.flatnonzero(taken).tolist():
@@ -200,14 +193,11 @@ class SlotLot:
 def slot_surroundings(lot: SlotLot, lanes: Sequence[ArrayLike] = (), **more: object) -> Surroundings:
     """Return asphalt under slots and lanes, and painted lines at both sides of slots and at the ends of kerbside ones.
 
-    Args:
-        lot: the slots.
-        lanes: polylines, (k, 2) m; the asphalt reaches `PAVED_MARGIN_M` beyond them and the slots.
-        more: other fields of `Surroundings`.
+    The asphalt reaches `PAVED_MARGIN_M` beyond lanes, polylines (k, 2) m, and slots; `more` are other fields.
     """
     plain = Surroundings(**more)  # type: ignore[arg-type]
     ends = slot_lines(lot)
-    everything = [ends[:, :2], ends[:, 2:4], *(floats("lanes", lane, 2) for lane in lanes)]
+    everything = [ends[:, :2], ends[:, 2:4], *(as_floats("lanes", lane, None, 2) for lane in lanes)]
     point = np.concatenate(everything)
     paved = list(plain.paved)
     if len(point) and not paved:
@@ -248,25 +238,10 @@ def scene_of_slots(
     manners: ParkingManners | None = None,
     **surroundings: object,
 ) -> Scene:
-    """Make a scene of parking slots and their occupancy in one call.
+    """Make a scene of parking slots and their occupancy in one call; see `SlotLot` and `SlotLot.scene`.
 
-    Args:
-        slot_xy: (n, 2) m, centres.
-        slot_yaw: (n,) rad, heading of a car that is parked nose-in.
-        slot_length: (n,) or () m, along the yaw.
-        slot_width: (n,) or () m.
-        occupied: (n,) bool.
-        kerbside: (n,) or () bool, slots that lie along the lane.
-        arrivals: (n,) or () int, 0 or more: index of the arrival in each slot.
-        lanes: polylines, (k, 2) m, which are paved.
-        seed: 0 or more.
-        manners: distribution of parking poses.
-        surroundings: fields of `Surroundings`: walls, buildings, trees and so on.
-
-    Examples:
-        >>> scene = scene_of_slots([[0, 0], [2.5, 0]], [1.57, 1.57], 5.0, 2.5, np.array([True, False]))
-        >>> scene.present.tolist(), len(scene.ground.markings)
-        ([0], 3)
+    Lanes, polylines (k, 2) m, are paved; `surroundings` are fields of `Surroundings`: walls, buildings, trees and so
+    on.
     """
     lot = SlotLot(
         slot_xy, slot_yaw, slot_length, slot_width, kerbside, None, manners or ParkingManners(), seed=seed

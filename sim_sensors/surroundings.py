@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray
 from sim_sensors import scenery
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, as_floats, require_seed
 from sim_sensors.mesh import Ground, Mesh
 
 TREE_KINDS = 8
@@ -26,23 +26,6 @@ class Standing(NamedTuple):
     mesh: Mesh
     pose: tuple[float, float, float]
     footprint: FloatArray | None = None
-
-
-def floats(name: str, value: ArrayLike, columns: int) -> FloatArray:
-    """Return `value` as a finite, read-only (n, columns) float64 array; an empty one may have any shape."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise SensorError(f"{name} is {value!r}, want (n, {columns}) numbers") from error
-    if array.size == 0:
-        array = array.reshape(0, columns)
-    if array.ndim != 2 or array.shape[1] != columns:
-        raise SensorError(f"{name} has shape {array.shape}, want (n, {columns})")
-    if not np.isfinite(array).all():
-        row, column = np.argwhere(~np.isfinite(array))[0]
-        raise SensorError(f"{name}[{row}, {column}] is {array[row, column]}, want a finite number")
-    array.setflags(write=False)
-    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +62,12 @@ class Surroundings:
     _outlines: tuple[FloatArray, ...] = field(init=False, repr=False, default=())
 
     def __post_init__(self) -> None:
-        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
-            raise SensorError(f"seed is {self.seed!r}, want an integer, 0 or more")
+        require_seed(self.seed)
         tables = {"markings": 5, "walls": 5, "trees": 3, "lamp_posts": 3, "pedestrians": 4}
         for name, columns in tables.items():
-            object.__setattr__(self, name, floats(name, getattr(self, name), columns))
+            object.__setattr__(self, name, as_floats(name, getattr(self, name), None, columns))
         for name, least in (("paved", 3), ("buildings", 3), ("kerbs", 2)):
-            rows = tuple(floats(f"{name}[{i}]", row, 2) for i, row in enumerate(getattr(self, name)))
+            rows = tuple(as_floats(f"{name}[{i}]", row, None, 2) for i, row in enumerate(getattr(self, name)))
             short = [i for i, row in enumerate(rows) if len(row) < least]
             if short:
                 raise SensorError(
@@ -95,9 +77,7 @@ class Surroundings:
         heights = (
             np.full(len(self.buildings), 9.0) if self.building_heights is None else self.building_heights
         )
-        heights = floats("building_heights", np.reshape(heights, (-1, 1)), 1)[:, 0]
-        if len(heights) != len(self.buildings):
-            raise SensorError(f"building_heights has {len(heights)} heights, want {len(self.buildings)}")
+        heights = as_floats("building_heights", heights, len(self.buildings))
         object.__setattr__(self, "building_heights", heights)
         least_values = (("building_heights", heights, 2.4), ("trees", self._table("trees")[:, 2], 1.5))
         for name, column, low in least_values:

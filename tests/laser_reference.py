@@ -1,30 +1,14 @@
 """The scan by its definition: every beam against every segment, in float64. Slow; what the fast path is held to."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
-from sim_sensors.laser.footprints import NO_RETURN, WALL, ScanPlane
-from sim_sensors.laser.scanner import LaserScanner
+from sim_sensors.laser.footprints import NO_RETURN, WALL
 
 
-def scan(
-    scanner: LaserScanner, plane: ScanPlane, pose: Sequence[float], *, exclude: int | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """An exact scan: the nearest crossing of each beam with an edge of a footprint or with a wall.
+def scan(scanner, plane, pose, *, exclude=None):
+    """Ranges, m, without noise and ids: the nearest crossing of each beam with an edge of a footprint or a wall.
 
-    Args:
-        scanner: its beams and its range are used, its noise is not.
-        plane: what stands there.
-        pose: (3,) x, y (m) and yaw (rad) of the sensor in the world frame.
-        exclude: id of footprints to look through.
-
-    Returns:
-        ranges: (n_beams,) float64, m, `inf` for no return, 0 if the sensor is inside a footprint.
-        ids: (n_beams,) int64, the id hit, `WALL` or `NO_RETURN`.
+    The range is `inf` for no return, and 0 if the sensor is inside a footprint.
     """
     origin, yaw = np.array(pose[:2], float), pose[2]
     corners, n_corners = plane.footprints
@@ -59,5 +43,5 @@ def scan(
     return ranges, np.where(np.isfinite(ranges), np.concatenate(labels)[nearest], NO_RETURN)
 
 
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+def _cross(a, b):
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_sensors.camera.materials import LINEAR, RESPONSE
+from sim_sensors.camera.materials import LINEAR, RESPONSE, facade
 from sim_sensors.camera.sky import mirrored_sky, sky_of_view
 from sim_sensors.camera.textures import cloud_tile, grain_tile
-from sim_sensors.facades import facade
 from sim_sensors.mesh import Material
 
 

@@ -2,26 +2,17 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_sensors.camera.textures import cloud_noise, fractal_noise
-from sim_sensors.camera.weather import Weather
-
-Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 
 _SHARP = 768  # texels across the hemisphere
 _BLURRED = 160
 
 
-def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
-    """Return the upper hemisphere, sharp for the background and blurred for reflections.
+def sky_domes(weather):
+    """Return the upper hemisphere, sharp and blurred, two arrays (n, n, 3) float32, linear RGB radiance.
 
-    Both are paraboloid maps: direction (x, y, z) with z ≥ 0 lies at ((x, y) / (1 + z) + 1) / 2 of the side. They
-    include the skyline of distant trees and roofs.
-
-    Returns:
-        two arrays (n, n, 3) float32, linear RGB radiance.
+    Both are paraboloid maps: direction (x, y, z) with z ≥ 0 lies at ((x, y) / (1 + z) + 1) / 2 of the side.
     """
     rng = np.random.default_rng([weather.seed, 7])
     side = (np.arange(_SHARP) + 0.5) / _SHARP * 2.0 - 1.0
@@ -44,17 +35,14 @@ def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
     return sharp, np.ascontiguousarray(blurred, dtype=np.float32)
 
 
-def _glow(weather: Weather, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
+def _glow(weather, x, y, z):
     """Return the brightness of the sky around the sun."""
     sun = weather.sun_direction
     cosine = np.clip(x * sun[0] + y * sun[1] + z * sun[2], 0.0, 1.0)
-    glow: FloatArray = cosine**6 + 3.0 * cosine**60 + 12.0 * cosine**1500
-    return glow
+    return cosine**6 + 3.0 * cosine**60 + 12.0 * cosine**1500
 
 
-def _with_clouds(
-    dome: FloatArray, weather: Weather, rng: np.random.Generator, x: FloatArray, y: FloatArray, z: FloatArray
-) -> FloatArray:
+def _with_clouds(dome, weather, rng, x, y, z):
     noise = (0.5 + 0.2 * fractal_noise(256, rng, 1.5)).astype(np.float32)
     # A layer of clouds at unit height, stretched towards the horizon but not infinitely.
     column = (x / (z + 0.2) * 0.17 * 256) % 256
@@ -66,13 +54,10 @@ def _with_clouds(
     cover = np.clip((sheet - threshold + 0.06) * 4.0, 0.0, 1.0)[..., None]
     brightness = 0.75 + 0.5 * np.clip(sheet, 0.0, 1.0)[..., None]
     white = np.array(weather.sky) * 0.95 + np.array(weather.sun) * 0.12
-    blended: FloatArray = dome * (1.0 - cover) + white * brightness * cover
-    return blended
+    return dome * (1.0 - cover) + white * brightness * cover
 
 
-def _with_skyline(
-    dome: FloatArray, weather: Weather, rng: np.random.Generator, x: FloatArray, y: FloatArray, z: FloatArray
-) -> FloatArray:
+def _with_skyline(dome, weather, rng, x, y, z):
     """Draw distant trees and roofs, up to about 8° high, in haze."""
     azimuth = np.mod(np.arctan2(y, x) / (2.0 * np.pi), 1.0)
     bins = 1024
@@ -91,5 +76,4 @@ def _with_skyline(
     veil = min(0.85, 0.12 + weather.haze * 120.0)
     far = far * (1.0 - veil) + np.array(weather.horizon) * veil
     mask = np.clip((height - z) * 400.0 + 0.5, 0.0, 1.0)[..., None]
-    blended: FloatArray = dome * (1.0 - mask) + far * mask
-    return blended
+    return dome * (1.0 - mask) + far * mask

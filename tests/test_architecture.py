@@ -228,7 +228,6 @@ def test_what_is_imported_alone_is_light(module, unloaded):
 
 
 def test_every_name_that_a_package_lists_can_be_imported():
-    for package in ("sim_sensors", "sim_sensors.camera", "sim_sensors.laser", "sim_sensors.vehicles"):
-        module = importlib.import_module(package)
-        for name in module.__all__:
-            assert getattr(module, name).__name__ == name
+    module = importlib.import_module("sim_sensors")
+    for name in module.__all__:
+        assert getattr(module, name).__name__ == name

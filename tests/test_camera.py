@@ -90,14 +90,8 @@ def test_shading_is_that_of_plain_python(preset):
     camera, pose = PinholeCamera.from_field_of_view(64, 48), camera_pose(-1.0, 0.2, 1.5, 0.1, -0.1, 0.02)
     weather = Weather.draw(preset, 4)
     maps = light_maps(scene.pool, scene.instances, weather, 8.0, 0.0)
-    seen = (
-        *camera.visibility(scene, pose),
-        pose,
-        camera.intrinsics,
-        weather,
-        ground_texture(scene.ground),
-        maps,
-    )
+    ground = ground_texture(scene.ground)
+    seen = (*camera.visibility(scene, pose), pose, camera.intrinsics, weather, ground, maps)
     assert set(seen[0].material[np.unique(seen[1].triangle[seen[1].triangle >= 0])]) == {0, 9, 10}
     assert (seen[1].pane >= 0).mean() > 0.01
     ours, plain = shade(*seen), plain_radiance(*seen)
@@ -287,36 +281,24 @@ def test_noise_has_the_stated_deviation():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("make", "message"),
     [
-        ({"width": 0}, "image size is 0×480"),
-        ({"fx": -1.0}, "fx is -1.0"),
-        ({"cy": math.nan}, "cy is nan"),
-        ({"supersampling": 3}, "supersampling is 3"),
-        ({"coarse_beyond": math.nan}, "coarse_beyond is nan"),
+        (lambda _: PinholeCamera(width=0), "image size is 0×480"),
+        (lambda _: PinholeCamera(fx=-1.0), "fx is -1.0"),
+        (lambda _: PinholeCamera(cy=math.nan), "cy is nan"),
+        (lambda _: PinholeCamera(supersampling=3), "supersampling is 3"),
+        (lambda _: PinholeCamera(coarse_beyond=math.nan), "coarse_beyond is nan"),
+        (lambda _: PinholeCamera.from_field_of_view(horizontal=4.0), "field of view is 4"),
+        (lambda _: StereoCamera(baseline=0.0), "baseline is 0"),
+        (lambda _: ImageSensor(blur=2.0), "blur is 2"),
+        (lambda _: Weather.draw("snow", 0), "want one of sunny"),
+        (lambda _: camera_pose(math.nan, 0.0, 1.0, 0.0), "want finite"),
+        (lambda row: CAMERA.render(row, POSE[:3]), r"shape \(3, 4\)"),
+        (lambda row: CAMERA.render(row, 2.0 * POSE), "want a rotation"),
+        (lambda row: CAMERA.render(row, camera_pose(0.0, 0.0, -0.1, 0.0)), "above the ground"),
+        (lambda row: CAMERA.render(row, camera_pose(0.3, -6.1, 0.8, 0.0)), "inside vehicle 3"),
     ],
 )
-def test_bad_cameras_are_refused(arguments, message):
+def test_bad_input_is_refused(row, make, message):
     with pytest.raises(SensorError, match=message):
-        PinholeCamera(**arguments)
-
-
-def test_other_bad_input_is_refused(scene, row):
-    with pytest.raises(SensorError, match="field of view is 4"):
-        PinholeCamera.from_field_of_view(horizontal=4.0)
-    with pytest.raises(SensorError, match="baseline is 0"):
-        StereoCamera(baseline=0.0)
-    with pytest.raises(SensorError, match="blur is 2"):
-        ImageSensor(blur=2.0)
-    with pytest.raises(SensorError, match="want one of sunny"):
-        Weather.draw("snow", 0)
-    with pytest.raises(SensorError, match="want finite"):
-        camera_pose(math.nan, 0.0, 1.0, 0.0)
-    with pytest.raises(SensorError, match=r"shape \(3, 4\)"):
-        CAMERA.render(scene, POSE[:3])
-    with pytest.raises(SensorError, match="want a rotation"):
-        CAMERA.render(scene, 2.0 * POSE)
-    with pytest.raises(SensorError, match="above the ground"):
-        CAMERA.render(scene, camera_pose(0.0, 0.0, -0.1, 0.0))
-    with pytest.raises(SensorError, match="inside vehicle 3"):
-        CAMERA.render(row, camera_pose(0.3, -6.1, 0.8, 0.0))
+        make(row)

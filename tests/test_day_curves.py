@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from parkenv.forecast.baselines import last_four_weekdays, last_week, with_past_errors
-from parkenv.forecast.comparison import MODELS, compare
+from parkenv.forecast.comparison import MODELS, compare, last_four_weekdays, last_week, with_past_errors
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_curves import CurveSettings, fit_settings, forecast_days
 from parkenv.forecast.day_forecast import DayForecast

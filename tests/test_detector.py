@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import os
 import zipfile
 
 import cv2
@@ -11,12 +12,7 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError
-from parkenv.perception.car_datasets import (
-    Crops,
-    LabelledImage,
-    read_uiuc_test,
-    read_uiuc_training,
-)
+from parkenv.perception.car_datasets import Crops, LabelledImage, read_uiuc_test, read_uiuc_training
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.detection_scores import matches, recall_on_crops, recall_precision, score_on
 from parkenv.perception.detector import Detections, GroundBand
@@ -39,7 +35,7 @@ def toy_car(rng, size=(100, 40)):
 def clutter(rng):
     image = rng.integers(60, 160, (12, 30)).astype(np.uint8)
     return cv2.resize(
-        image, (150, 60), interpolation=cv2.INTER_NEAREST if rng.random() < 0.5 else cv2.INTER_CUBIC
+        image, (150, 60), None, 0, 0, cv2.INTER_NEAREST if rng.random() < 0.5 else cv2.INTER_CUBIC
     )
 
 
@@ -92,22 +88,17 @@ def test_cars_are_found_where_they_are_at_every_size(model):
     assert not len(HogDetector((model,), threshold=0.5).detect(street(rng, [])))
 
 
-def test_equal_training_gives_equal_files(crops, model, tmp_path):
+def test_equal_training_gives_equal_files_from_which_a_model_comes_back(crops, model, tmp_path):
     again = train(*crops, settings=TrainingSettings(rounds=2, seed=1), trained_on="toys")
     model.save(tmp_path / "a.npz")
     again.save(tmp_path / "b.npz")
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    other = train(*crops, settings=TrainingSettings(rounds=2, seed=2))
-    assert not np.array_equal(other.weights, model.weights)
-
-
-def test_a_model_comes_back_from_its_file(model, tmp_path):
-    model.save(tmp_path / "m.npz")
-    back = CarModel.load(tmp_path / "m.npz")
+    one, two = (train(*crops, settings=TrainingSettings(rounds=0, seed=seed)).weights for seed in (1, 2))
+    assert not np.array_equal(one, two)
+    back = CarModel.load(tmp_path / "a.npz")
     np.testing.assert_array_equal(back.weights, model.weights)
-    assert (back.bias, back.calibration, back.car, back.trained_on) == (
-        model.bias, model.calibration, model.car, "toys",
-    )  # fmt: skip
+    for name in ("bias", "calibration", "car", "trained_on"):
+        assert getattr(back, name) == getattr(model, name)
 
 
 def test_bad_model_files_are_told_apart(model, tmp_path):
@@ -179,16 +170,9 @@ def test_a_part_of_a_large_car_is_no_second_car_but_a_neighbour_is():
 
 
 def test_parts_of_cars_are_mined_where_there_are_no_photographs(crops):
-    plain, closer = (
-        train(*crops, settings=TrainingSettings(rounds=2, enlarged=by), trained_on="toys")
-        for by in (0.0, 2.0)
-    )
+    plain, closer = (train(*crops, settings=TrainingSettings(rounds=2, enlarged=by)) for by in (0.0, 2.0))
     rng = np.random.default_rng(3)
-    wheels = [
-        cv2.resize(toy_car(rng), (300, 120))[60:120, 75 * k : 75 * k + 150]
-        for k in (0, 1, 2)
-        for _ in range(20)
-    ]
+    wheels = [cv2.resize(toy_car(rng), (300, 120))[60:120, 75 * (k // 20) :][:, :150] for k in range(60)]
     windows = np.stack([cv2.resize(w, (128, 64)) for w in wheels])
     cars = np.stack([cv2.resize(toy_car(rng), (128, 64)) for _ in range(20)])
     assert closer.scores(windows).max() < plain.scores(windows).max()
@@ -211,14 +195,8 @@ def test_recall_and_precision_of_a_known_case():
 
 def test_the_ellipse_is_a_quarter_of_the_box():
     truth = np.array([[100, 100, 200, 140]], float)
-    for dx, dy, dw, inside in (
-        (24, 0, 0, 1),
-        (26, 0, 0, 0),
-        (0, 9.9, 0, 1),
-        (18, 8, 0, 0),
-        (0, 0, 24, 1),
-        (0, 0, 26, 0),
-    ):
+    cases = (24, 0, 0, 1), (26, 0, 0, 0), (0, 9.9, 0, 1), (18, 8, 0, 0), (0, 0, 24, 1), (0, 0, 26, 0)
+    for dx, dy, dw, inside in cases:
         box = np.array([[100 + dx - dw / 2, 100 + dy, 200 + dx + dw / 2, 140 + dy]], float)
         assert matches(box, truth)[0] == bool(inside), (dx, dy, dw)
     assert matches(np.array([[75, 100, 225, 140]], float), truth, scales=False)[0]
@@ -305,12 +283,7 @@ def test_uiuc_is_read_as_published_trained_on_and_judged(tmp_path):
         (lambda f: (f / "trueLocations.txt").write_text("\n"), "trueLocations.txt: names no image"),
         (lambda f: (f / "trueLocations.txt").unlink(), "trueLocations.txt: no such file"),
         (lambda f: (f / "TestImages/test-0.pgm").unlink(), "test-0.pgm: No such file"),
-        (
-            lambda f: (f / "TestImages/test-0.pgm").write_bytes(
-                (f / "TestImages/test-0.pgm").read_bytes()[:900]
-            ),
-            "test-0.pgm: is not a complete image",
-        ),
+        (lambda f: os.truncate(f / "TestImages/test-0.pgm", 900), "test-0.pgm: is not a complete image"),
     ],
 )
 def test_a_damaged_set_is_named(tmp_path, break_it, message):

@@ -27,12 +27,8 @@ def sigmoid(x):
 
 def evidence(slots, taken):
     states = np.asarray(taken, float)
-    return Evidence(
-        np.asarray(slots),
-        np.full(len(states), 9.0),
-        np.column_stack([1.0 - states, states]),
-        np.ones(len(states)),
-    )
+    likelihood = np.column_stack([1.0 - states, states])
+    return Evidence(np.asarray(slots), np.full(len(states), 9.0), likelihood, np.ones(len(states)))
 
 
 def trip(key, day, slots, taken, hit_rate=1.0, false_alarm_rate=0.0, after_s=None):
@@ -52,9 +48,8 @@ def test_the_error_of_one_slot_has_its_exact_posterior(taken, free):
     density = np.exp(-0.5 * (GRID / 1.5) ** 2) * sigmoid(GRID + 0.3) ** taken * sigmoid(-GRID - 0.3) ** free
     density /= density.sum()
     mean, variance = error.predict(9.0)
-    assert EVEN.expit(0.3 + mean, np.sqrt(variance))[0][0, 0] == pytest.approx(
-        density @ sigmoid(GRID + 0.3), abs=0.01
-    )
+    p = EVEN.expit(0.3 + mean, np.sqrt(variance))[0][0, 0]
+    assert p == pytest.approx(density @ sigmoid(GRID + 0.3), abs=0.01)
     assert mean[0, 1] == 0.0
     assert variance[0, 1] == pytest.approx(1.5**2)
 
@@ -85,11 +80,8 @@ def test_the_prior_that_foretold_the_observations_gains_weight():
     for logit, states, winner in ((0.0, np.arange(10) % 2, 0), (-3.0, np.ones(10), 1)):
         error = MapError(np.linspace(1.0, -1.0, 20), priors)
         for day in range(4):
-            error.observe(
-                evidence(np.arange(0, 20, 2), np.roll(states, day)),
-                np.full((len(error.weights), 10), logit),
-                (0.5, 0.0),
-            )
+            logits = np.full((len(error.weights), 10), logit)
+            error.observe(evidence(np.arange(0, 20, 2), np.roll(states, day)), logits, (0.5, 0.0))
         assert error.weights.max() > 0.8
         assert (error.prior_sd()[error.weights.argmax(), 0] > 1.0) == (winner == 1)
 
@@ -113,9 +105,8 @@ def test_an_empty_map_learns_the_level_from_half_of_the_slots_and_forgets_it():
         learned.learn([trip(f"{day}", day, slots, rng.random(len(slots)) < 0.9)])
     soon = learned.forecast(MORNING)
     assert soon.p_occupied[1::2].mean() == pytest.approx(0.9, abs=0.08)
-    assert (
-        soon.day_error.level < LearnedMap(EmptyMap(n), np.arange(n), NO_MAP).forecast(MORNING).day_error.level
-    )
+    empty = LearnedMap(EmptyMap(n), np.arange(n), NO_MAP)
+    assert soon.day_error.level < empty.forecast(MORNING).day_error.level
     learned.pass_time(20_000)
     np.testing.assert_allclose(learned.forecast(MORNING).p_occupied, 0.5, atol=0.01)
 
@@ -175,11 +166,8 @@ def test_what_a_trip_says_about_a_slot():
         states = state_likelihoods(its, known)
         assert states.slots.tolist() == slots[:1]
         assert states.time.tolist() == [its.time]
-        np.testing.assert_allclose(
-            states.likelihood[:, 1] / states.likelihood[:, 0],
-            np.array(wanted)[:, 1] / np.array(wanted)[:, 0],
-            rtol=1e-9,
-        )
+        free, taken_ = states.likelihood.T
+        np.testing.assert_allclose(taken_ / free, np.array(wanted)[:, 1] / np.array(wanted)[:, 0], rtol=1e-9)
     assert len(state_likelihoods(trip("a", 0, [0, 0], [True, False], after_s=np.zeros(2)), known).slots) == 0
 
 
@@ -191,10 +179,8 @@ def test_a_car_that_several_drivers_see_counts_once():
         known = EmptyMap(n).forecast(MORNING)
         weights = []
         for i in range(3):
-            states = state_likelihoods(
-                trip("a", 0, np.arange(n), np.ones(n), after_s=np.full(n, i * apart_s)), known
-            )
-            weights.append(memory.add(states, known))
+            again = trip("a", 0, np.arange(n), np.ones(n), after_s=np.full(n, i * apart_s))
+            weights.append(memory.add(state_likelihoods(again, known), known))
         rate = known.decay_rate[0]
         np.testing.assert_allclose(weights[0], 1.0)
         np.testing.assert_allclose(weights[1:], 1.0 - np.exp(-rate * apart_s))

@@ -60,10 +60,10 @@ def mini():
     return make_scenario("mini").lot
 
 
-def drive_by(lot, scene, noise=None, step=1.0):
+def drive_by(lot, scene, noise=None, slots=None):
     """A filter after a laser has passed the whole lot."""
-    slots = SlotFilter(lot)
-    for x in np.arange(lot.vertex_xy[:, 0].min(), lot.vertex_xy[:, 0].max(), step):
+    slots = slots or SlotFilter(lot)
+    for x in np.arange(lot.vertex_xy[:, 0].min(), lot.vertex_xy[:, 0].max(), 1.0):
         pose = np.array([x, lot.vertex_xy[:, 1].mean(), 0.0])
         slots.update_from_scan(scan_from_laser(LASER, MOUNT, pose, LASER.scan(scene.scan_plane, pose, noise)))
     return slots
@@ -108,12 +108,8 @@ def test_a_detection_goes_to_its_slot_and_one_elsewhere_to_none(mini):
 
 
 def test_a_car_that_leaves_during_the_drive_is_noticed(mini):
-    full = slot_lot(mini).scene(np.ones(mini.n_slots, bool))
-    slots = drive_by(mini, full)
-    empty = slot_lot(mini).scene(np.zeros(mini.n_slots, bool))
-    for x in np.linspace(mini.vertex_xy[:, 0].min(), mini.vertex_xy[:, 0].max(), 20):
-        pose = np.array([x, mini.vertex_xy[:, 1].mean(), 0.0])
-        slots.update_from_scan(scan_from_laser(LASER, MOUNT, pose, LASER.scan(empty.scan_plane, pose)))
+    full, empty = (slot_lot(mini).scene(np.full(mini.n_slots, taken)) for taken in (True, False))
+    slots = drive_by(mini, empty, slots=drive_by(mini, full))
     assert not slots.states().occupied.any()
 
 
@@ -289,13 +285,8 @@ def test_a_strangers_journal_removes_no_file(mini, tmp_path):
     magic, name, size = bytes.fromhex("d9d505f920a163d7"), os.fsencode(mine), path.stat().st_size
     page = int.from_bytes(path.read_bytes()[16:18], "big")
     head = (magic + b"".join(n.to_bytes(4, "big") for n in (0, 1, size // page, 512, page))).ljust(512, b"\0")
-    tail = [
-        (2**30 // page + 1).to_bytes(4, "big"),
-        name,
-        len(name).to_bytes(4, "big"),
-        sum(name).to_bytes(4, "big"),
-    ]
-    (tmp_path / "map.sqlite-journal").write_bytes(head + b"".join(tail) + magic)
+    place, length, checksum = (n.to_bytes(4, "big") for n in (2**30 // page + 1, len(name), sum(name)))
+    (tmp_path / "map.sqlite-journal").write_bytes(head + place + name + length + checksum + magic)
     (tmp_path / "link").symlink_to(path)
     for opened in (path, tmp_path / "link"):
         for create in (False, True):
@@ -319,10 +310,8 @@ with MapStore(Path(sys.argv[1]), lot) as store:
 
 def test_two_processes_write_at_once(mini, tmp_path):
     file = tmp_path / "m.sqlite"
-    work = [
-        subprocess.Popen([sys.executable, "-c", _WRITER, file, name, "15"], stdout=subprocess.PIPE)
-        for name in "ab"
-    ]
+    words = [sys.executable, "-c", _WRITER, file]
+    work = [subprocess.Popen([*words, name, "15"], stdout=subprocess.PIPE) for name in "ab"]
     assert [w.wait(60) for w in work] == [0, 0]
     with MapStore(file, mini, create=False) as store:
         assert len(store.sessions()) == 30
@@ -331,9 +320,8 @@ def test_two_processes_write_at_once(mini, tmp_path):
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_kill_leaves_whole_sessions_only(mini, tmp_path):
     file = tmp_path / "m.sqlite"
-    writer = subprocess.Popen(
-        [sys.executable, "-c", _WRITER, file, "a", "5000"], stdout=subprocess.PIPE, text=True
-    )
+    words = [sys.executable, "-c", _WRITER, file, "a", "5000"]
+    writer = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     for _ in range(5):
         writer.stdout.readline()
     time.sleep(0.01)
@@ -342,9 +330,7 @@ def test_a_kill_leaves_whole_sessions_only(mini, tmp_path):
     with MapStore(file, mini, create=False) as store:
         there = store.sessions()
     assert len(there) >= 5
-    for one in there:
-        assert len(one.cars) == 50
-        assert np.isfinite(one.p_occupied).all()
+    assert all(len(session.cars) == 50 and np.isfinite(session.p_occupied).all() for session in there)
 
 
 def test_slots_are_found_where_cars_stand_again_and_again():
@@ -391,9 +377,8 @@ def test_half_a_metre_of_pose_error_is_borne_and_two_are_not(mini):
             xs = np.arange(mini.vertex_xy[:, 0].min(), mini.vertex_xy[:, 0].max(), 1.0)
             true = np.column_stack([xs, np.full(len(xs), mini.vertex_xy[:, 1].mean()), np.zeros(len(xs))])
             for pose, belief in zip(true, PoseNoise(position).estimated(true, rng), strict=True):
-                slots.update_from_scan(
-                    scan_from_laser(LASER, MOUNT, belief, LASER.scan(scene.scan_plane, pose))
-                )
+                ranges = LASER.scan(scene.scan_plane, pose)
+                slots.update_from_scan(scan_from_laser(LASER, MOUNT, belief, ranges))
             right.append((slots.states().occupied == taken).mean())
         return np.mean(right)
 

@@ -62,19 +62,7 @@ def test_the_shipped_file_is_small_and_holds_nothing_but_a_network(net):
     assert not zipfile.is_zipfile(str(FILE))
     model = load_onnx(str(FILE))
     kinds = {node.op_type for node in model.graph.node}
-    assert kinds <= {
-        "Add",
-        "Cast",
-        "Clip",
-        "Concat",
-        "Conv",
-        "Exp",
-        "Mul",
-        "Relu",
-        "Resize",
-        "Sigmoid",
-        "Softmax",
-    }
+    assert kinds <= set("Add Cast Clip Concat Conv Exp Mul Relu Resize Sigmoid Softmax".split())
     assert all(np.isfinite(numpy_helper.to_array(t)).all() for t in model.graph.initializer)
     card = {key: json.loads(value) for key, value in ((p.key, p.value) for p in model.metadata_props)}
     slope, offset = card["calibration"]
@@ -189,9 +177,8 @@ def test_small_pictures_are_looked_at_mirrored_too(net, street):
         assert (other.view[j], other.end_on[j]) == (found.view[i], found.end_on[i])
     once = with_settings(net.settings.changed(mirror=False))
     assert not np.array_equal(once.detect(small).probability, found.probability)
-    assert np.array_equal(
-        once.detect(street[0]).boxes, net.detect(street[0]).boxes
-    )  # this one fills the input
+    # This one fills the input.
+    assert np.array_equal(once.detect(street[0]).boxes, net.detect(street[0]).boxes)
 
 
 def test_what_takes_detectors_takes_net(tmp_path, street):

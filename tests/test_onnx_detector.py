@@ -85,9 +85,8 @@ def test_boxes_are_those_of_a_plain_decoding(tmp_path, channels, settings, thres
         found = detector.detect(image)
         wanted = plain_detect(tiny, image, threshold, overlap, channels == 1)
         assert len(wanted) > 1
-        np.testing.assert_allclose(
-            np.column_stack([found.boxes, found.probability]), wanted, rtol=1e-3, atol=2e-2
-        )
+        rows = np.column_stack([found.boxes, found.probability])
+        np.testing.assert_allclose(rows, wanted, rtol=1e-3, atol=2e-2)
         width, height = (found.boxes[:, 2:] - found.boxes[:, :2]).T
         np.testing.assert_array_equal(found.end_on, width < 1.8 * height)
 
@@ -124,15 +123,11 @@ def test_a_detector_is_copied_and_equal_runs_are_equal_on_any_number_of_threads(
 
 def test_a_network_that_crashes_opencv_is_refused_in_a_line(tmp_path):
     model = Tiny().model()
-    (pads,) = (
-        a for n in model.graph.node if n.op_type == "Conv" for a in n.attribute[:1] if n.output[0] == "c0"
-    )
-    pads.ints[:] = [0, 0]
+    (convolution,) = (node for node in model.graph.node if node.op_type == "Conv" and node.output[0] == "c0")
+    convolution.attribute[0].ints[:] = [0, 0]
     (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
     (tmp_path / "a.toml").write_text(TOML)
-    with pytest.raises(
-        InputError, match=r"a\.onnx: OpenCV cannot run this network with an input of shape \(1, 3"
-    ):
+    with pytest.raises(InputError, match=r"a\.onnx: OpenCV cannot run this network .* shape \(1, 3"):
         make_detector(str(tmp_path / "a.onnx"))
 
 
@@ -146,9 +141,8 @@ def classifier():
     given = [numpy_helper.from_array(np.array([1, -1]), "shape")]
     image = helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 64, 64])
     flat = helper.make_tensor_value_info("class", TensorProto.FLOAT, [1, 12288])
-    graph = helper.make_graph(
-        [helper.make_node("Reshape", ["images", "shape"], ["class"])], "g", [image], [flat], given
-    )
+    node = helper.make_node("Reshape", ["images", "shape"], ["class"])
+    graph = helper.make_graph([node], "g", [image], [flat], given)
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
 
 
@@ -261,19 +255,11 @@ def test_specifications_name_detectors(tmp_path):
     (tmp_path / "e.toml").write_text('kind = "compare"\nrig = "laser"\ndetector = "a.onnx"\n')
     assert Comparison.read(tmp_path / "e.toml").detector == str(file)
     for text, kind, message in (
-        (
-            'lot = "mini"\ndetector = "mod:Mine"',
-            ScenarioSpec,
-            "want hog, net, side, front or a file.*class of your own",
-        ),
-        (
-            'lot = "mini"\ndetector = "b.onnx"',
-            ScenarioSpec,
-            "detector is 'b.onnx', want a file; there is none at",
-        ),
+        ('lot = "mini"\ndetector = "mod:Mine"', ScenarioSpec, "want hog, net, side, front or a file.*class of your"),
+        ('lot = "mini"\ndetector = "b.onnx"', ScenarioSpec, "detector is 'b.onnx', want a file; there is none at"),
         ('kind = "survey"\ndetector = 3', SurveyStudy, "detector is 3, want text"),
         ('kind = "compare"\ndetector = "side"', Comparison, "detector requires a rig"),
-    ):
+    ):  # fmt: skip
         (tmp_path / "bad.toml").write_text(text)
         with pytest.raises(InputError, match=message):
             kind.read(tmp_path / "bad.toml")
@@ -281,11 +267,9 @@ def test_specifications_name_detectors(tmp_path):
 
 @pytest.mark.slow
 def test_a_network_surveys(tmp_path):
-    file = Tiny().save(tmp_path / "a.onnx")
+    file, out = Tiny().save(tmp_path / "a.onnx"), tmp_path / "s"
     (tmp_path / "a.toml").write_text(TOML + "threshold = 0.6\n")
-    out = tmp_path / "s"
-    ran = ("--scenario", "mini", "--jobs", 1, "--detector", file, "--out", out)
-    done = parkenv("survey", "--sessions", 1, "--every", 8, *ran)
+    done = parkenv("survey --scenario mini --sessions 1 --every 8 --jobs 1", "--detector", file, "--out", out)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((out / "summary.json").read_text())["rows"]
     assert row["detector"] == file
@@ -298,18 +282,8 @@ def test_a_network_looks_in_worker_processes_too(tmp_path):
     totals = []
     for jobs in (2, 1):
         out = tmp_path / str(jobs)
-        words = (
-            "--scenario",
-            "mini",
-            "--agents",
-            "first-free",
-            "-n",
-            2,
-            "--occupancy-levels",
-            "none",
-            "--no-figures",
-        )
-        done = parkenv("compare", *words, "--rig", "laser", "--detector", file, "--jobs", jobs, "--out", out)
+        words = "compare --scenario mini --agents first-free -n 2 --occupancy-levels none --no-figures --rig laser"
+        done = parkenv(words, "--detector", file, "--jobs", jobs, "--out", out)
         assert done.returncode == 0, done.stderr
         totals.append((out / "episodes.csv").read_text())
         assert detector_version(file) in (out / SETTINGS).read_text()
@@ -322,12 +296,11 @@ def test_a_network_looks_in_worker_processes_too(tmp_path):
 def test_photographs_are_searched_and_scored_with_it(tmp_path):
     file = Tiny().save(tmp_path / "a.onnx")
     cv2.imwrite(str(tmp_path / "photo.png"), photo())
-    done = parkenv(
-        "detect", tmp_path / "photo.png", "--detector", file, "--threshold", 0.5, "--out", tmp_path / "d"
-    )
+    words = ("detect", tmp_path / "photo.png", "--detector", file)
+    done = parkenv(*words, "--threshold", 0.5, "--out", tmp_path / "d")
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "d" / "summary.json").read_text())["rows"]
     assert rows
     assert min(row["probability"] for row in rows) >= 0.5
-    refused = parkenv("detect", tmp_path / "photo.png", "--detector", file, "--model", "side")
+    refused = parkenv(*words, "--model", "side")
     assert "excludes --model" in refused.stderr

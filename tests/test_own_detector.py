@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import parkenv
 from onnx import TensorProto, helper, numpy_helper
 
 from parkenv import InputError, make_scenario
@@ -82,23 +83,9 @@ def test_the_environment_observes_slots_with_it():
 
 @pytest.mark.usefixtures("in_examples")
 def test_the_command_line_takes_it(tmp_path):
-    from command_line import parkenv
-
     out = tmp_path / "s"
-    words = (
-        "survey",
-        "--scenario",
-        "mini",
-        "--sessions",
-        "1",
-        "--every",
-        "15",
-        "--jobs",
-        "1",
-        "--out",
-        str(out),
-    )
-    assert parkenv(*words, "--detector", OWN).returncode == 0
+    words = "survey --scenario mini --sessions 1 --every 15 --jobs 1"
+    assert parkenv(words, "--detector", OWN, "--out", out).returncode == 0
     (row,) = json.loads((out / "summary.json").read_text())["rows"]
     assert row["detector"] == OWN
     assert detector_version(OWN) in (out / "sessions.csv").read_text()

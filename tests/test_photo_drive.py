@@ -51,9 +51,8 @@ def usual_box(ground, ahead, aside, view, tall=HEIGHT, wide=None, foot=None):
     bottom = ground.pixels(tyres, 0.0, 0.0)[1]
     top = ground.pixels(ahead + usual.roof, 0.0, tall)[1]
     # Sides are measured at the row of the tyres, and as far ahead as the nearest side.
-    scale = CAMERA.fx * (
-        math.cos(ground.mount.pitch) + (bottom - CAMERA.cy) / CAMERA.fy * math.sin(ground.mount.pitch)
-    )
+    pitch = ground.mount.pitch
+    scale = CAMERA.fx * (math.cos(pitch) + (bottom - CAMERA.cy) / CAMERA.fy * math.sin(pitch))
     sides = CAMERA.cx + scale * (aside + np.array([-0.5, 0.5]) * width) / ahead
     return np.array([sides[0], top, sides[1], bottom])
 
@@ -156,38 +155,28 @@ def test_tables_and_tracks_say_the_same(tmp_path):
     frame, xy = LocalFrame(7.85, 48.0), np.column_stack([np.linspace(0.0, 9.0, 10), np.zeros(10)])
     lonlat = frame.to_lonlat(xy)
     times = [f"2026-05-04T09:00:{k:02d}.250Z" for k in range(10)]
-    (tmp_path / "t.gpx").write_text(
-        GPX.format("".join(POINT.format(*p[::-1], t) for p, t in zip(lonlat, times, strict=True)))
-    )
-    with (tmp_path / "p.csv").open("w", newline="") as file:
-        csv.writer(file).writerows(
-            [
-                ("time", "lat", "lon", "speed"),
-                *((t, y, x, 3) for t, (x, y) in zip(times, lonlat, strict=True)),
-            ]
-        )
-    with (tmp_path / "h.csv").open("w", newline="") as file:
-        csv.writer(file).writerows(
-            [("time", "x", "y", "heading"), *((t, x, y, 90.0) for t, (x, y) in zip(times, xy, strict=True))]
-        )
+    points = "".join(POINT.format(*p[::-1], t) for p, t in zip(lonlat, times, strict=True))
+    (tmp_path / "t.gpx").write_text(GPX.format(points))
+    globe = [
+        ("time", "lat", "lon", "speed"),
+        *((t, y, x, 3) for t, (x, y) in zip(times, lonlat, strict=True)),
+    ]
+    plane = [("time", "x", "y", "heading"), *((t, x, y, 90.0) for t, (x, y) in zip(times, xy, strict=True))]
+    for name, rows in (("p.csv", globe), ("h.csv", plane)):
+        with (tmp_path / name).open("w", newline="") as file:
+            csv.writer(file).writerows(rows)
     track, table, metres = (read_track(tmp_path / name) for name in ("t.gpx", "p.csv", "h.csv"))
     for one in (table, metres):
         np.testing.assert_array_equal(track.stamps, one.stamps)
-    assert (
-        track.stamps[0]
-        == int(datetime.datetime(2026, 5, 4, 9, tzinfo=datetime.UTC).timestamp()) * 10**9 + 250_000_000
-    )
-    np.testing.assert_allclose(frame.to_xy(track.positions), metres.positions, atol=2e-3)
-    np.testing.assert_allclose(
-        track.headings(frame.to_xy(track.positions)), metres.headings(metres.positions), atol=1e-3
-    )
+    start = int(datetime.datetime(2026, 5, 4, 9, tzinfo=datetime.UTC).timestamp())
+    assert track.stamps[0] == start * 10**9 + 250_000_000
+    positions = frame.to_xy(track.positions)
+    np.testing.assert_allclose(positions, metres.positions, atol=2e-3)
+    np.testing.assert_allclose(track.headings(positions), metres.headings(metres.positions), atol=1e-3)
 
 
-BOMB = (
-    '<!DOCTYPE gpx [<!ENTITY a "aaaaaaaaaa">'
-    + "".join(f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">' for k in range(9))
-    + "]><gpx>&j;</gpx>"
-)
+ENTITIES = "".join(f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">' for k in range(9))
+BOMB = f'<!DOCTYPE gpx [<!ENTITY a "aaaaaaaaaa">{ENTITIES}]><gpx>&j;</gpx>'
 
 
 @pytest.mark.parametrize(

@@ -196,11 +196,8 @@ def test_fitted_cars_stand_where_the_cars_do(name):
         for k in range(len(found)):
             true = scene.vehicle_pose[places[k]]
             for way, errors in off.items():
-                car = way(found.select(np.array([k])), scan, CAMERA, EYE, pose)
-                errors += [
-                    (np.hypot(*(xy - true[:2])), turned_off(yaw, true[2]))
-                    for xy, yaw in zip(car.xy, car.yaw, strict=True)
-                ]
+                for x, y, yaw in way(found.select(np.array([k])), scan, CAMERA, EYE, pose).poses:
+                    errors.append((np.hypot(x - true[0], y - true[1]), turned_off(yaw, true[2])))
     fitted, plain = (np.array(off[way]) for way in (localize_cars, localize_median))
     assert len(fitted) > 25
     assert np.median(fitted[:, 0]) < 0.3 < np.median(plain[:, 0])

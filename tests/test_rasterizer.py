@@ -39,39 +39,6 @@ def test_depth_agrees_with_a_ray_caster(seed):
     assert np.mean(error > 0.01) < 0.002
 
 
-def test_depth_agrees_with_embree():
-    trimesh = pytest.importorskip("trimesh")
-    embree = pytest.importorskip("trimesh.ray.ray_pyembree")
-    scene = random_boxes(11, count=60)
-    camera = PinholeCamera()
-    pose = camera_pose(0.0, 0.0, 1.4, 0.7, -0.05, 0.1)
-    corners = scene.soup()
-    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
-    rays = camera_rays(camera) @ pose[:3, :3].T
-    origin = np.broadcast_to(pose[:3, 3], rays.shape)
-    hit, ray = embree.RayMeshIntersector(mesh).intersects_id(origin, rays, multiple_hits=False)[:2]
-    a, b, c = corners[hit].transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    depth = np.full(len(rays), np.inf)
-    depth[ray] = ((a - origin[ray]) * normal).sum(1) / (rays[ray] * normal).sum(1)
-    with np.errstate(divide="ignore"):
-        ground = np.where(rays[:, 2] < 0.0, -1.4 / rays[:, 2], np.inf)
-    ground[ground > FAR] = np.inf
-    theirs = np.minimum(depth, ground).reshape(camera.height, camera.width)
-    ours = depth_of(scene, camera, pose)
-    seen = np.isfinite(theirs) & np.isfinite(ours)
-    error = np.abs(ours[seen] - theirs[seen])
-    assert np.median(error) < 1e-3
-    assert np.mean(error > 0.01) < 0.002
-    assert np.mean(np.isfinite(theirs) != np.isfinite(ours)) < 0.002
-
-
-def camera_rays(camera):
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
-    return rays.reshape(-1, 3)
-
-
 def test_a_wall_beside_and_behind_the_camera_is_clipped_not_dropped():
     # One 40 m quad of two triangles passes 0.3 m to the right of the camera, from far behind to far ahead.
     scene = toy_scene([box_mesh(40.0, 0.2, 3.0, Material.STONE)], [(0, 0.0, -0.4, 0.0, 0.0)], [0])

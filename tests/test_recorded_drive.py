@@ -50,23 +50,14 @@ def image(k):
     return picture
 
 
-def bag(
-    folder,
-    poses=11,
-    pictures=5,
-    scans=11,
-    pose_type="nav_msgs/msg/Odometry",
-    shift=None,
-    order=None,
-    raw=True,
-):
+def bag(folder, poses=11, pictures=5, pose_type="nav_msgs/msg/Odometry", shift=(), order=(), raw=True):
     """Write a rosbag of somebody's car: poses every 0.1 s, pictures every 0.2 s, scans 0.02 s after poses."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     t = store.types
-    shift = shift or {}
+    shift, order = dict(shift), dict(order)
 
     def header(stamp):
         return t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), "")
@@ -101,14 +92,14 @@ def bag(
     kinds = {
         "/odom": (pose_type, poses, TENTH, 0, pose),
         "/camera": (image_type, pictures, 2 * TENTH, TENTH // 4, picture),
-        "/scan": ("sensor_msgs/msg/LaserScan", scans, TENTH, TENTH // 5, scan),
+        "/scan": ("sensor_msgs/msg/LaserScan", 11, TENTH, TENTH // 5, scan),
     }
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for topic, (kind, count, every, late, make) in kinds.items():
             if not count:
                 continue
             connection = writer.add_connection(topic, kind, typestore=store)
-            for i, k in enumerate((order or {}).get(topic, range(count))):
+            for i, k in enumerate(order.get(topic, range(count))):
                 begin = START + late + int(shift.get(topic, 0) * 1e9)
                 message = make(begin + k * every, k)
                 writer.write(connection, begin + i * every, store.serialize_cdr(message, kind))
@@ -141,12 +132,9 @@ def test_a_bag_of_somebodys_car_becomes_captures(tmp_path, raw, pose_type):
     assert len(list(drive.captures(every=1.0))) == 3
     again = RecordedDrive(tmp_path / "bag", calibrated(tmp_path))  # the folder of the bag
     np.testing.assert_array_equal(again.poses, drive.poses)
-    moved = calibrated(
-        tmp_path, CALIBRATION.replace("timezone_h", "origin = { x = 5.0, yaw = 90.0 }\ntimezone_h")
-    )
-    np.testing.assert_allclose(
-        RecordedDrive(file, moved).poses[4], [4.0, 1.2, drive.poses[4, 2] + math.pi / 2], atol=1e-9
-    )
+    moved = calibrated(tmp_path, f"origin = {{ x = 5.0, yaw = 90.0 }}\n{CALIBRATION}")
+    wanted = [4.0, 1.2, drive.poses[4, 2] + math.pi / 2]
+    np.testing.assert_allclose(RecordedDrive(file, moved).poses[4], wanted, atol=1e-9)
 
 
 def test_rosbags_of_ros_1_and_ros_2_hold_the_same_drive(tmp_path):
@@ -154,12 +142,8 @@ def test_rosbags_of_ros_1_and_ros_2_hold_the_same_drive(tmp_path):
     from rosbags.rosbag2 import Reader, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
-    file, ros1, ros2 = (
-        bag(tmp_path / "bag"),
-        get_typestore(Stores.ROS1_NOETIC),
-        get_typestore(Stores.ROS2_HUMBLE),
-    )
-    sqlite = tmp_path / "sqlite"
+    ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+    file, sqlite = bag(tmp_path / "bag"), tmp_path / "sqlite"
     with (
         Reader(file) as reader,
         Writer(sqlite, version=9, storage_plugin=StoragePlugin.SQLITE3) as new,
@@ -181,9 +165,8 @@ def test_rosbags_of_ros_1_and_ros_2_hold_the_same_drive(tmp_path):
         for (one, pose), (other, other_pose) in zip(wanted, found, strict=True):
             assert one.time == other.time
             np.testing.assert_array_equal(pose, other_pose)
-            np.testing.assert_array_equal(
-                one.capture.images["right"].image, other.capture.images["right"].image
-            )
+            pictures = [captured.capture.images["right"].image for captured in (one, other)]
+            np.testing.assert_array_equal(*pictures)
             np.testing.assert_array_equal(one.capture.scans["front"], other.capture.scans["front"])
 
 

@@ -148,11 +148,9 @@ def test_the_scan_plane_of_a_changed_scene_is_that_of_one_made_anew():
         taken[slot] = not taken[slot]
         assert "scan_plane" in vars(changed)
     anew = lot.scene(taken, number)
-    for one, other in zip(
-        *(LaserScanner().scan_batch_with_ids(scene.scan_plane, poses) for scene in (changed, anew)),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(one, other)
+    scans = [LaserScanner().scan_with_ids(scene.scan_plane, poses) for scene in (changed, anew)]
+    for part in range(2):
+        np.testing.assert_array_equal(scans[0][part], scans[1][part])
 
 
 def test_the_car_in_a_slot_depends_on_seed_slot_and_arrival_alone():
@@ -269,7 +267,7 @@ def test_overlapping_cars_are_allowed_and_warned_of():
     ("call", "match"),
     [
         (lambda: Scene.from_arrays([[0, np.nan, 0]], [1]), r"poses\[0, 1\] .*want a finite number"),
-        (lambda: Scene.from_arrays([[0, 0]], [1]), r"poses has shape .*want \(n, 3\)"),
+        (lambda: Scene.from_arrays([[0, 0]], [1]), r"poses has shape .*want \(any, 3\)"),
         (lambda: Scene.from_arrays([[0, 0, 0]], [1, 2]), "seeds"),
         (lambda: Scene.from_arrays([[0, 0, 0]], [1], ["tank"]), "body"),
         (lambda: Scene.from_arrays([[0, 0, 0]], [1]).with_vehicle(1), "place is 1, want 0 to 0"),

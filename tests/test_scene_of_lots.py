@@ -43,10 +43,8 @@ def test_marks_lie_on_their_lanes_and_entries_lead_in(name):
         assert one_way.distance(ahead) < 1e-6
     np.testing.assert_array_equal(outline.entries[:, :2], lot.entries)
     asphalt = polygons(outline.paved())
-    onward = outline.entries[:, :2] + 3.0 * np.stack(
-        [np.cos(outline.entries[:, 2]), np.sin(outline.entries[:, 2])], 1
-    )
-    assert shapely.contains(asphalt, shapely.points(onward)).all()
+    x, y, yaw = outline.entries.T
+    assert shapely.contains_xy(asphalt, x + 3.0 * np.cos(yaw), y + 3.0 * np.sin(yaw)).all()
 
 
 def test_painted_lines_leave_the_mouth_open():
@@ -91,18 +89,15 @@ def test_both_painters_give_every_layer_its_colour_at_its_place():
     axes.paint(ax, layers, 1.0)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    places = [
-        ((1.0, 4.5), "asphalt"),
-        ((6.0, 3.0), "white"),
-        ((9.0, 3.0), "white"),
-        ((2.0, 3.0), "car"),
-        ((2.0, 1.6), "goal"),
-        ((2.6, 1.0), "asphalt"),
-        ((2.6, 5.0), "entry"),
-        ((2.0, 5.6), "asphalt"),
-    ]
+    places = {
+        "asphalt": [(1.0, 4.5), (2.6, 1.0), (2.0, 5.6)],
+        "white": [(6.0, 3.0), (9.0, 3.0)],
+        "car": [(2.0, 3.0)],
+        "goal": [(2.0, 1.6)],
+        "entry": [(2.6, 5.0)],
+    }
     for picture in (image, np.asarray(canvas.buffer_rgba())[..., :3]):
-        for (x, y), color in places:
+        for color, (x, y) in ((name, at) for name in places for at in places[name]):
             found = picture[round(50 * (6 - y)) - 1, round(50 * x)].astype(int)
             np.testing.assert_allclose(found, PALETTE[color], atol=2, err_msg=f"{x}, {y}")
         assert shows_color(picture, PALETTE["ink"]), "the halo"

@@ -27,10 +27,11 @@ def test_the_nearest_band_that_reaches_holds():
     assert rates.false_alarm.tolist() == [0.01, 0.01, 0.2, 0.2, 0.3, 0.3]
 
 
-def test_files_bring_back_what_was_written(tmp_path):
-    model = SensorModel(12.0, 0.8, 0.3, BANDS)
-    model.to_file(tmp_path / "sight.json")
-    assert SensorModel.from_file(tmp_path / "sight.json") == model
+def test_files_bring_back_what_was_written_and_say_what_they_are(tmp_path):
+    model, file = SensorModel(12.0, 0.8, 0.3, BANDS), tmp_path / "sight.json"
+    model.to_file(file)
+    assert SensorModel.from_file(file) == model
+    assert json.loads(file.read_text())["format"] == "parkenv-sensor-model"
 
 
 @pytest.mark.parametrize(
@@ -87,12 +88,7 @@ def test_unseen_slots_are_known_once_they_were_tried():
     np.testing.assert_array_equal(observation["p_occupied"][others], prior[others])
 
 
-@given(
-    hit=st.floats(0.7, 1.0),
-    false_alarm=st.floats(0.0, 0.3),
-    seen=st.floats(0.1, 1.0),
-    seed=st.integers(0, 99),
-)
+@given(st.floats(0.7, 1.0), st.floats(0.0, 0.3), st.floats(0.1, 1.0), st.integers(0, 99))
 def test_counts_give_the_rates_that_they_were_drawn_from(hit, false_alarm, seen, seed):
     rng = np.random.default_rng(seed)
     n, looks = 4000, ObservationCounts.none().counts
@@ -126,11 +122,6 @@ def test_looks_of_a_real_search_are_counted():
     np.testing.assert_array_equal(looks, again)
     with pytest.raises(InputError, match="rig is 'sonar'"):
         count_observations(scenario, "sonar", "mdp", [0])
-
-
-def test_the_file_says_what_it_is(tmp_path):
-    SensorModel().to_file(tmp_path / "s.json")
-    assert json.loads((tmp_path / "s.json").read_text())["format"] == "parkenv-sensor-model"
 
 
 @pytest.mark.slow

@@ -83,7 +83,7 @@ def test_peers_measure_what_the_laser_measures(scanner, tolerance):
     plane, draw = sensors.walled_lot(np.random.default_rng(3), 30)
     peer = scanner(plane, laser)
     poses = draw(3)
-    ours, theirs = (np.minimum(s, laser.max_range) for s in (laser.scan_batch(plane, poses), peer(poses)))
+    ours, theirs = (np.minimum(s, laser.max_range) for s in (laser.scan(plane, poses), peer(poses)))
     assert ((np.abs(ours - theirs) > tolerance).mean(axis=1) < 0.05).all()
     np.testing.assert_array_equal(peer(poses), np.concatenate([peer(pose[None]) for pose in poses]))
 

@@ -176,8 +176,8 @@ class TrainDetector(Command):
 
     def run(self) -> None:
         from parkenv.files.atomic_write import check_writable
-        from parkenv.perception.car_regions import END, SIDE
         from parkenv.perception.hog import Descriptor
+        from parkenv.perception.hog_detector import END, SIDE
         from parkenv.perception.training import TrainingSettings, train
 
         if self.out.suffix != ".npz":

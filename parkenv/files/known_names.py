@@ -20,7 +20,7 @@ WeatherName = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
 LocaliserName = Literal["none", "scan-matching"]
 LOCALISERS: tuple[LocaliserName, ...] = get_args(LocaliserName)
-"""What corrects the pose of a survey's car; see `parkenv.mapping.localisation`."""
+"""What corrects the pose of a survey's car; see `parkenv.mapping.scan_matching`."""
 MapName = Literal["empty", "right", "wrong"]
 """Maps that a commute starts from."""
 KnowledgeName = Literal["own", "shared", "reserve", "full"]

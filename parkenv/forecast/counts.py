@@ -77,11 +77,10 @@ class Counts:
 
     @classmethod
     def read(cls, path: str | Path, timezone: str = "Europe/Berlin") -> Counts:
-        """Read a file of counts and clean it.
+        """Read and clean a file of counts, .csv or .csv.gz.
 
-        Args:
-            path: .csv or .csv.gz.
-            timezone: IANA name of the local time of `hour_utc` and `time_utc`, and of when summer time begins and ends.
+        `timezone`, an IANA name, is the local time of `hour_utc` and `time_utc`, and of when summer time begins and
+        ends.
         """
         zone = _time_zone(timezone)
         readings = _read(path, zone)
@@ -114,7 +113,6 @@ class Counts:
         return found
 
     def chosen(self, names: Iterable[str]) -> Counts:
-        """Return the counts of some car parks."""
         rows = []
         for name in names:
             if name not in self.car_parks:
@@ -249,7 +247,6 @@ def _cleaned(readings: _Readings, zone: ZoneInfo, source: str) -> Counts:
 
 
 def _span(present: BoolArray) -> slice:
-    """Return the days from the first to the last with a reading."""
     where = np.flatnonzero(present)
     return slice(where[0], where[-1] + 1) if where.size else slice(0)
 

@@ -7,7 +7,9 @@ The log-odds of a car park's occupancy over a day are a curve of harmonics of th
 - the day's own deviation, correlated from day to day (first-order autoregression),
 
 and is observed with noise: that of the hour, and that of a finite number of places. Days that fit badly count less.
-Public holidays, as far as earlier years show them, have the curve of a Sunday. All car parks are filtered at once; what
+Public holidays have the curve of a Sunday: dates on which car parks were as on a Sunday a year before, known by day and
+month, or by their distance from Easter. So no calendar is needed, but the first year of a record knows of no holidays.
+All car parks are filtered at once; what
 they share are the variances (`CurveSettings`), fitted to the past by maximum likelihood of the occupied places.
 
 References:
@@ -17,20 +19,19 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import asdict, dataclass, replace
-from typing import Literal
+from datetime import date
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, gammaln
+from scipy.special import expit, gammaln, logit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.forecast.calibration import calibrated
 from parkenv.forecast.counts import HOURS, Counts
-from parkenv.forecast.day_forecast import DIAGONAL, FREEDOM, DayForecast, logits
+from parkenv.forecast.day_forecast import DIAGONAL, FREEDOM, DayForecast, calibrated, logits
 from parkenv.forecast.scores import log_losses
-from parkenv.forecast.special_days import SpecialDays
 
 Mode = Literal["past", "rolling"]
 
@@ -53,6 +54,10 @@ _MIN_HOURS_SPECIAL = 8  # to tell whether a day was as a Sunday
 _SETTLED = 28  # days from which on weekdays and Sundays are told apart
 _MEMORY = 30.0  # days over which the scale of the noise is averaged
 _OUTLIER = 2.0  # ratio of squared error to variance from which on a day counts less
+_MOVING = (-2, 1, 39, 50, 60)  # Good Friday, Easter Monday, Ascension, Whit Monday, Corpus Christi
+_RARE = 0.005  # share of holidays among days of which nothing is known
+_OWN = 2.5  # most that the one observation of a car park itself counts, logits
+_CLEAR = 6.0  # logits from which on a day is taken for a Sunday when models learn from it
 _FIT_CAR_PARKS = 14
 _FIT_DAYS = 400
 _FIT_WARM_UP = 45
@@ -109,7 +114,6 @@ class _Filter:
         self.covariance = np.tile(np.diag(start), (n, 1, 1))
 
     def next_day(self) -> None:
-        """Let one day pass."""
         memory = self._settings.day_memory
         self.mean[:, _TODAY] *= memory
         self.covariance[:, _TODAY] *= memory
@@ -117,7 +121,6 @@ class _Filter:
         self.covariance[:, np.arange(_STATE), np.arange(_STATE)] += self._drift
 
     def curve(self, weekday: int) -> _Curve:
-        """Return the forecast of the curve of a weekday."""
         parts = [slice(b * _SIZE, (b + 1) * _SIZE) for b in _BLOCKS[weekday]]
         across = np.asarray(sum(self.covariance[:, :, part] for part in parts))
         mean = np.asarray(sum(self.mean[:, part] for part in parts))
@@ -142,7 +145,6 @@ class _Curve:
     across: FloatArray
 
     def where(self, mask: BoolArray, other: _Curve) -> _Curve:
-        """Return this curve for the car parks of `mask`, else the other."""
         if not mask.any():
             return other
         m = mask[:, None, None]
@@ -176,7 +178,6 @@ class _Fit:
     log_det: FloatArray
 
     def where(self, mask: BoolArray, other: _Fit) -> _Fit:
-        """Return this fit for the car parks of `mask`, else the other."""
         if not mask.any():
             return other
         return _Fit(
@@ -195,6 +196,57 @@ class _Fit:
         )
 
 
+def key_of(day: date) -> Hashable:
+    """Return what identifies a date in every year.
+
+    >>> key_of(date(2024, 5, 9)) == key_of(date(2023, 5, 18)), key_of(date(2024, 10, 3))
+    (True, (10, 3))
+    """
+    after_easter = (day - _easter(day.year)).days
+    return after_easter if after_easter in _MOVING else (day.month, day.day)
+
+
+def _easter(year: int) -> date:
+    """Return Easter Sunday of a year (J. Meeus, Astronomical Algorithms, 1991, chapter 8).
+
+    >>> _easter(2024)
+    datetime.date(2024, 3, 31)
+    """
+    golden, (century, rest) = year % 19, divmod(year, 100)
+    epact = (19 * golden + century - century // 4 - (century - (century + 8) // 25 + 1) // 3 + 15) % 30
+    weekday = (32 + 2 * (century % 4) + 2 * (rest // 4) - epact - rest % 4) % 7
+    late = (golden + 11 * epact + 22 * weekday) // 451
+    month, day = divmod(epact + weekday - 7 * late + 114, 31)
+    return date(year, month, day + 1)
+
+
+class SpecialDays:
+    """What earlier years say of the dates of the year, for n car parks."""
+
+    def __init__(self, n: int) -> None:
+        self._n = n
+        self._known: dict[Hashable, tuple[NDArray[np.float64], float]] = {}
+
+    def expected(self, day: date) -> NDArray[np.bool_]:
+        evidence, share = self._known.get(key_of(day), (np.zeros(self._n), _RARE))
+        return np.asarray(logit(share) + np.clip(evidence, -_OWN, _OWN) > 0)
+
+    def observe(
+        self, day: date, evidence: NDArray[np.float64], observed: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Take in a day, and return the car parks (n,) where it clearly was as a Sunday.
+
+        `evidence`, (n,), is the log-likelihood of the day as a Sunday minus that as its own weekday; `observed`, (n,),
+        says whether enough was observed of it.
+        """
+        alike: Any = expit(logit(_RARE) + evidence)[observed]
+        share = float((alike.sum() + 2 * _RARE) / (alike.size + 2))
+        evidence = np.where(observed, evidence, 0.0)
+        if observed.any() and day.weekday() < 5:  # a Saturday may look like a Sunday anyway
+            self._known[key_of(day)] = (evidence, share)
+        return np.asarray(logit(share) + evidence > _CLEAR)
+
+
 def filter_days(
     counts: Counts,
     settings: CurveSettings,
@@ -203,36 +255,26 @@ def filter_days(
     until: int | None = None,
     on_day: Callable[[int], None] | None = None,
 ) -> DayForecast:
-    """Forecast every day from all days before it.
+    """Forecast every day from all days before it; the covariances are the model's own, and not calibrated.
 
-    Args:
-        counts: what was observed.
-        settings: of the model.
-        first: index of the first day to return; the filter starts with day 0.
-        last: index after the last day.
-        until: index of the first day from which nothing is learned any more; the days from there on are forecast
-            several days ahead.
-        on_day: called with the number of the days done.
-
-    Returns:
-        Forecasts; their covariances are the model's own, and not calibrated.
+    The filter starts with day 0, and returns the days from index `first` to `last` - 1. From `until` on nothing is
+    learned any more: the days from there on are forecast several days ahead. `on_day` is called with the number of the
+    days done.
     """
     c = len(counts.car_parks)
     state, special = _Filter(c, settings), SpecialDays(c)
-    mean, covariance = (
-        np.empty((c, last - first, HOURS)),
-        np.empty((c, last - first, HOURS, HOURS), np.float32),
-    )
+    mean = np.empty((c, last - first, HOURS))
+    covariance = np.empty((c, last - first, HOURS, HOURS), np.float32)
     scale, memory = np.ones(c), np.full(c, 15.0)
     until = last if until is None else until
     for day in range(last):
         state.next_day()
-        date, weekday = counts.days[day], int(counts.weekday[day])
+        weekday = int(counts.weekday[day])
         places = counts.capacity[:, max(min(day, until) - 1, 0), None]
         own = curve = state.curve(weekday)
         sunday = state.curve(_SUNDAY) if weekday != _SUNDAY and day >= _SETTLED else None
         if sunday is not None:
-            curve = sunday.where(special.expected(date), own)
+            curve = sunday.where(special.expected(counts.days[day]), own)
         if day >= first:
             middle = curve.mean @ _BASIS.T
             p = expit(middle)
@@ -254,7 +296,7 @@ def filter_days(
             if sunday is not None:
                 other = sunday.fit(z, weight)
                 evidence = other.log_likelihood(hours) - fit.log_likelihood(hours)
-                mask = special.observe(date, evidence, hours >= _MIN_HOURS_SPECIAL)
+                mask = special.observe(counts.days[day], evidence, hours >= _MIN_HOURS_SPECIAL)
                 curve, fit = sunday.where(mask, own), other.where(mask, fit)
             error = fit.distance / np.maximum(hours, 1)
             memory = np.where(learned, np.minimum(memory + 1.0, _MEMORY), memory)
@@ -317,12 +359,8 @@ def forecast_days(
 ) -> DayForecast:
     """Forecast the days from index `first` on, with spreads calibrated on earlier days.
 
-    Args:
-        counts: what was observed.
-        first: index of the first day; the settings are fitted to the days before it.
-        mode: rolling: each day from all days before it; past: all days from those before `first`.
-        settings: instead of fitted ones.
-        on_day: called with the number of the days done.
+    Each is forecast from all days before it (`rolling`), or all from those before `first` (`past`); settings are fitted
+    to the days before `first` if none are given. `on_day` is called with the number of the days done.
     """
     settings = fit_settings(counts, first) if settings is None else settings
     n, until = len(counts.days), first if mode == "past" else None

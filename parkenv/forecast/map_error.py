@@ -137,7 +137,6 @@ class MapError:
 
     @property
     def weights(self) -> FloatArray:
-        """(k,) float64, the probability of each prior."""
         return np.asarray(np.exp(self._log_weights))
 
     def prior_sd(self) -> FloatArray:
@@ -154,12 +153,9 @@ class MapError:
         self._covariance = gone * self._covariance + (1.0 - gone) * self._priors
 
     def observe(self, evidence: Evidence, logits: FloatArray, day_error: tuple[float, float]) -> None:
-        """Add the observations of one day.
+        """Add the observations of one day, with the map's logits x for them, (n_priors, k).
 
-        Args:
-            evidence: the observations; k states.
-            logits: (n_priors, k) float64, the map's logits x for them.
-            day_error: standard deviations of level and slope of the day, logits.
+        `day_error` are the standard deviations of level and slope of the day, logits.
         """
         if not len(evidence.slots):
             return
@@ -230,16 +226,10 @@ def _summed(parts: Iterable[FloatArray]) -> FloatArray:
 def _approximate(
     mean: FloatArray, covariance: FloatArray, evidence: Evidence
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Approximate likelihoods of k states by Gaussian ones, by expectation propagation.
+    """Approximate likelihoods of k states by Gaussian ones, by expectation propagation, for p priors.
 
-    Args:
-        mean: (p, k) prior means of the logits, for p priors.
-        covariance: (p, k, k).
-        evidence: the observations.
-
-    Returns:
-        (p, k) precisions, (p, k) precision times location, and (p,) log evidence (of the first sweep, in which each
-        observation is predicted from those before it).
+    `mean`, (p, k), and `covariance`, (p, k, k), are of the logits. Return (p, k) precisions, (p, k) precision times
+    location, and (p,) log evidence (of the first sweep, in which each observation is predicted from those before it).
     """
     mean, covariance = mean.copy(), covariance.copy()
     precision, location = np.zeros_like(mean), np.zeros_like(mean)

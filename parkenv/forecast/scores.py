@@ -14,9 +14,16 @@ import numpy as np
 from scipy.special import expit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.forecast.calibration import MIN_HOURS, day_means, holds
 from parkenv.forecast.counts import Counts
-from parkenv.forecast.day_forecast import INTERVAL, DayForecast, draw_days, quantiles_of_t
+from parkenv.forecast.day_forecast import (
+    INTERVAL,
+    MIN_HOURS,
+    DayForecast,
+    day_means,
+    draw_days,
+    holds,
+    quantiles_of_t,
+)
 
 BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
 """Bands of fullness."""
@@ -39,11 +46,7 @@ def log_losses(forecast: DayForecast, occupied: FloatArray, capacity: FloatArray
 
 
 def crps_of_equally_likely(values: FloatArray, observed: FloatArray) -> FloatArray:
-    """Return the continuous ranked probability score of equally likely values.
-
-    Args:
-        values: (k, ...), ascending.
-        observed: (...).
+    """Return the continuous ranked probability score of equally likely values, (k, ...) ascending.
 
     >>> float(crps_of_equally_likely(np.array([0.0, 1.0]), np.array(0.0)))
     0.25
@@ -85,7 +88,6 @@ class Scores:
 
     @classmethod
     def of(cls, forecast: DayForecast, counts: Counts) -> Scores:
-        """Score a forecast of car parks."""
         c, d = forecast.mean.shape[:2]
         days = slice(forecast.first, forecast.first + d)
         y, places = counts.occupied[:, days], counts.capacity[:, days]
@@ -133,7 +135,6 @@ class Scores:
         return coverage_by_band(self.day_observed if observed else self.day_forecast, self.day_covered)
 
     def reliability(self) -> FloatArray:
-        """Return `reliability` of the forecasts."""
         return reliability(self.occupancy, self.observed, self.weight)
 
     def means(self) -> dict[str, float]:
@@ -171,9 +172,7 @@ class Scores:
 def coverage_by_band(fullness: FloatArray, covered: FloatArray) -> list[Band]:
     """Return the number of days in each band of fullness, and the share of them in their intervals.
 
-    Args:
-        fullness: mean occupancy of each day.
-        covered: alike, 1 where the day's interval holds what was observed, NaN where nothing was.
+    `covered` is 1 where the day's interval holds what was observed, NaN where nothing was.
     """
     rows: list[Band] = []
     for low, high in pairwise(BANDS):
@@ -192,11 +191,7 @@ def coverage_by_band(fullness: FloatArray, covered: FloatArray) -> list[Band]:
 def reliability(p: FloatArray, observed: FloatArray, weight: FloatArray, bins: int = 20) -> FloatArray:
     """Return mean forecast, mean of what was observed, and weight (3, k) of equally wide bins of the forecast.
 
-    Args:
-        p: forecasts, any shape.
-        observed: what was observed, alike.
-        weight: of each, 0 where nothing was observed.
-        bins: number of bins; empty ones are left out.
+    `weight` is 0 where nothing was observed. Empty bins are left out.
     """
     seen = weight > 0
     cell = np.minimum((p[seen] * bins).astype(int), bins - 1)
@@ -207,8 +202,6 @@ def reliability(p: FloatArray, observed: FloatArray, weight: FloatArray, bins: i
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % interval."""
-
     value: float
     low: float
     high: float
@@ -217,13 +210,7 @@ class Estimate(NamedTuple):
 def ratio_of_sums(
     total: FloatArray, n: FloatArray, rng: np.random.Generator, repetitions: int = 1000
 ) -> Estimate:
-    """Return sum(total) / sum(n), with its interval by a bootstrap over rows and columns.
-
-    Args:
-        total: (r, c) sums of what is averaged, such as losses by car park and week.
-        n: (r, c) their weights, such as numbers of readings.
-        rng: draws the rows and columns of each resample.
-        repetitions: number of resamples.
+    """Return sum(total) / sum(n), with its interval by a bootstrap over rows, such as car parks, and columns, as weeks.
 
     >>> ratio_of_sums(np.array([[1.0, 2.0]]), np.array([[2.0, 4.0]]), np.random.default_rng(0))
     Estimate(value=0.5, low=0.5, high=0.5)

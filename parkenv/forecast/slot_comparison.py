@@ -51,19 +51,11 @@ class ComparedSlots(NamedTuple):
 def compare_slot_days(
     classes: list[SlotDays], first: int, on_day: Callable[[], None] = lambda: None
 ) -> list[ComparedSlots]:
-    """Score forecasts of every day from `first` on.
+    """Score forecasts of every day from number `first` on that has a day of its class before; a row for each model.
 
     Baselines are the mean of the half-hour on some earlier days, shrunk to the mean of the lot by a Beta prior worth
     one day: all of them, the last four of the same weekday, or the last one; all days where none is of that weekday.
-    The day error of a baseline is that of its earlier forecasts.
-
-    Args:
-        classes: all days of each class.
-        first: number of the first day that is scored; days without one of their class before are not.
-        on_day: called after each day.
-
-    Returns:
-        A row for each model, ours first; none if no day can be scored.
+    The day error of a baseline is that of its earlier forecasts. Without a day that can be scored there are no rows.
     """
     models: dict[str, Callable[[SlotDays, Days], FloatArray]] = {
         "last-four-weekdays": lambda past, day: _shrunk_mean(past, _same_weekday(past, day)[-4:]),

@@ -59,8 +59,6 @@ least log-loss (compared with 0, 0.02, 0.05, 0.2, 0.5, 1 and 2), or with five an
 
 
 class Days(NamedTuple):
-    """Days, (d,) int64 each."""
-
     number: IntArray  # days since a fixed date
     weekday: IntArray  # 0 to 6
 
@@ -74,8 +72,6 @@ class SlotDays(NamedTuple):
 
 
 class SlotForecast(NamedTuple):
-    """Forecast of k days together."""
-
     p_taken: FloatArray  # (k, m, p) P(taken), the mean over what each day may be like
     # (p, k, k) covariance of the errors of the days' levels, logits²: what the days share is the fitted mean's error
     level_covariance: FloatArray
@@ -96,29 +92,18 @@ class _Solution(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FittedSlotDays:
-    """A model fitted to days.
-
-    Attributes:
-        days: the fitted days.
-        hyperparameters: (6,) logarithms, as `_MEDIAN`.
-        correction: (t,) logits, added to all slots.
-        habits: (m, k) coefficients of the slots, and habit_covariance (m, k, k) of their errors.
-        dispersion: (t,) of the states of a slot on a day.
-    """
-
     days: Days
     periods: tuple[int, int, int]  # first and last observed period of a day, and their number
     response: FloatArray  # (d, t) working response of the levels
     information: FloatArray  # (d, t) its precision
-    hyperparameters: FloatArray
-    correction: FloatArray
-    habits: FloatArray
-    habit_covariance: FloatArray
-    dispersion: FloatArray
+    hyperparameters: FloatArray  # (6,) logarithms, as `_MEDIAN`
+    correction: FloatArray  # (t,) logits, added to all slots
+    habits: FloatArray  # (m, k) coefficients of the slots
+    habit_covariance: FloatArray  # (m, k, k) of their errors
+    dispersion: FloatArray  # (t,) of the states of a slot on a day
 
     @property
     def level_sd(self) -> float:
-        """Standard deviation of a day's level, logits."""
         return float(np.hypot(*np.exp(self.hyperparameters[:2])))
 
     def forecast(self, days: Days) -> SlotForecast:
@@ -142,11 +127,7 @@ class FittedSlotDays:
 
 
 def fit_slot_days(data: SlotDays) -> FittedSlotDays:
-    """Fit the model to days of one class.
-
-    Args:
-        data: the days; at least one state was observed.
-    """
+    """Fit the model to days of one class; at least one state was observed."""
     observed = np.flatnonzero(data.seen.sum(axis=(0, 1)))
     periods = int(observed[0]), int(observed[-1]), data.seen.shape[2]
     window = slice(periods[0], periods[1] + 1)
@@ -233,12 +214,10 @@ class _Curves:
 
     @cached_property
     def _own_design(self) -> FloatArray:
-        """The design of the fitted days."""
         return self.design(self.days)
 
     @cached_property
     def _lag(self) -> FloatArray:
-        """Hours between periods, (t, t)."""
         return np.asarray(np.subtract.outer(self.hours, self.hours))
 
     @cached_property

@@ -42,8 +42,7 @@ class TypicalWeekFit:
 def fit_typical_week(counts: Counts) -> TypicalWeekFit | None:
     """Fit logit P(taken) = week[hour] + level[car park] by medians, which closing hours hardly move.
 
-    Returns:
-        None if no hour of the week has `LEAST_READINGS`.
+    None if no hour of the week has `LEAST_READINGS`.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "(Mean of empty slice|All-NaN)", RuntimeWarning)

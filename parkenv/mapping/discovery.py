@@ -19,16 +19,12 @@ _ROOM = (4.2, 1.9)  # m, least distance between slot centres along and across a 
 
 
 class FoundSlots(NamedTuple):
-    """Discovered slots."""
-
     xy: FloatArray  # (n, 2) m, centres
     yaw: FloatArray  # (n,) rad, along the slot, in [0, π)
     cars: NDArray[np.int64]  # (n,) int64, number of cars detected there
 
 
 class DiscoveryScore(NamedTuple):
-    """Errors of discovered slots."""
-
     precision: float  # fraction of the discovered slots that are true slots
     recall: float  # fraction of the true slots that were discovered
     error: float  # m, mean distance of matched slots
@@ -109,11 +105,7 @@ def score_discovery(
 ) -> DiscoveryScore:
     """Match discovered slots to the lot's slots one to one, nearest pairs first, and compute the errors.
 
-    Args:
-        found: result of `discover`.
-        lot: the true lot.
-        within: m, largest distance of a match.
-        turned: rad, largest angle of a match.
+    A match is at most `within` apart, m, and `turned`, rad.
     """
     away = np.hypot(*(found.xy[:, None] - lot.slot_xy[None]).transpose(2, 0, 1))
     turn = np.abs((found.yaw[:, None] - lot.slot_yaw[None] + math.pi / 2) % math.pi - math.pi / 2)

@@ -32,7 +32,6 @@ class MountSpec(Spec):
     pitch: Degrees = Field(0.0, description="Upwards, degrees.")
 
     def mount(self) -> Mount:
-        """Return the mount."""
         return Mount(self.x, self.y, self.z, math.radians(self.yaw), math.radians(self.pitch))
 
 
@@ -51,13 +50,10 @@ class Lens(Spec):
     mount: MountSpec = MountSpec()
 
     def camera(self) -> PinholeCamera:
-        """Return the camera."""
         return PinholeCamera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
 
 class CameraSpec(Lens):
-    """A camera and its topic."""
-
     name: Name
     topic: Topic = Field("/pictures", description="Topic of its images; none for photographs and films.")
 
@@ -98,14 +94,7 @@ class DriveCalibration(Spec):
     lasers: Several[LaserSpec] = Field((), max_length=16)
 
     def rig(self, lasers: dict[str, LaserScanner]) -> SensorRig:
-        """Return the rig.
-
-        Args:
-            lasers: the scanner of each laser, by name.
-
-        Raises:
-            InputError: there is no camera.
-        """
+        """Return the rig with the scanner of each laser, by name."""
         if not (self.cameras or self.stereo_cameras):
             raise InputError("has no camera, want cameras or stereo_cameras")
         return SensorRig(

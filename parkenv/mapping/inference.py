@@ -37,36 +37,23 @@ class SessionLog:
     known: NDArray[np.bool_]  # (k, n_slots) bool, whether the slot was observed
 
     def __post_init__(self) -> None:
-        if (
-            self.occupied.ndim != 2
-            or self.occupied.shape != self.known.shape
-            or len(self.time) != len(self.occupied)
-        ):
-            raise InputError(
-                f"sessions: {self.time.shape} times, {self.occupied.shape} states and {self.known.shape} views "
-                "do not go together"
-            )
+        shapes = self.time.shape, self.occupied.shape, self.known.shape
+        if self.occupied.ndim != 2 or shapes[1] != shapes[2] or len(self.time) != len(self.occupied):
+            raise InputError("sessions: {} times, {} states and {} views do not go together".format(*shapes))
 
     @property
     def n_slots(self) -> int:
-        """Number of slots."""
         return int(self.occupied.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The map's prediction for every slot.
-
-    Attributes:
-        p_occupied: (n_slots,) float64.
-        low, high: (n_slots,) float64, bounds of the credible interval of P(occupied).
-        sessions: (n_slots,) int64, number of sessions in which the slot was observed.
-    """
+    """The map's prediction for every slot, (n_slots,) each."""
 
     p_occupied: FloatArray
-    low: FloatArray
+    low: FloatArray  # and `high`: bounds of the credible interval of P(occupied)
     high: FloatArray
-    sessions: NDArray[np.int64]
+    sessions: NDArray[np.int64]  # number of sessions in which the slot was observed
 
 
 def counted(log: SessionLog) -> FloatArray:
@@ -97,12 +84,12 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
     weight = np.ones(len(log.time)) if time is None else _alike(log.time, time)
     at_hour = (weight @ taken.sum(axis=1) + LOT_WEIGHT * lot_mean) / (weight @ known.sum(axis=1) + LOT_WEIGHT)
     slot_mean = (taken.sum(axis=0) + SLOT_WEIGHT * lot_mean) / (known.sum(axis=0) + SLOT_WEIGHT)
-    prior = slot_mean if time is None else expit(logit(slot_mean) + logit(at_hour) - logit(lot_mean))
     # Over all sessions, the slot's mean already contains its counts: only the lot's prior must be added.
-    strength = SLOT_WEIGHT
-    base = np.full(log.n_slots, lot_mean) if time is None else prior
-    a = weight @ taken + strength * base
-    b = weight @ known + strength - a
+    base = np.full(log.n_slots, lot_mean)
+    if time is not None:
+        base = expit(logit(slot_mean) + logit(at_hour) - logit(lot_mean))
+    a = weight @ taken + SLOT_WEIGHT * base
+    b = weight @ known + SLOT_WEIGHT - a
     tail = 0.5 * (1.0 - confidence)
     return Prediction(
         a / (a + b),

@@ -56,33 +56,22 @@ SURVEYED = _priors({1.0: 0.5, 2.0: 0.5}, shape={**_SHAPE, "hour": 1.0})
 
 
 class EmptyMap(PriorModel):
-    """The map of a lot of which nothing is known: 50 % for every slot.
-
-    Args:
-        n_slots: number of slots.
-    """
+    """The map of a lot of which nothing is known: 50 % for every slot."""
 
     def __init__(self, n_slots: int) -> None:
         self._forecast = Forecast(np.full(n_slots, 0.5), np.full(n_slots, 1.0 / RELAXATION_S), USUAL_DAY)
 
     @property
     def n_slots(self) -> int:
-        """Number of slots."""
         return len(self._forecast.p_occupied)
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """Return 50 % for every slot."""
         del arrival
         return self._forecast
 
 
 class ReversedMap(PriorModel):
-    """A wrong map: slots near the goal get the forecast of slots far from it, and the other way round.
-
-    Args:
-        right: the map to reverse.
-        walk: (n,) walk from each slot to the goal.
-    """
+    """A wrong map: slots near the goal get the forecast of slots far from it by their walk, and the other way round."""
 
     def __init__(self, right: PriorModel, walk: ArrayLike) -> None:
         self._right = right
@@ -92,11 +81,9 @@ class ReversedMap(PriorModel):
 
     @property
     def n_slots(self) -> int:
-        """Number of slots."""
         return self._right.n_slots
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """Return the forecast with the slots in reverse order of their walks."""
         right = self._right.forecast(arrival)
         return Forecast(right.p_occupied[self._from], right.decay_rate[self._from], right.day_error)
 
@@ -156,7 +143,6 @@ class LearnedMap(PriorModel):
 
     @property
     def n_slots(self) -> int:
-        """Number of slots."""
         return self._base.n_slots
 
     def pass_time(self, day: int) -> None:
@@ -182,7 +168,6 @@ class LearnedMap(PriorModel):
             self._observe(Evidence(slots, hours, likelihood, weight), base.p_occupied[slots], base.day_error)
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """Return the forecast of the corrected map."""
         base, hour = self._base.forecast(arrival), arrival.time / HOUR_S
         p_taken, mean_logits = [], []
         mean, variance = self._error.predict(hour)

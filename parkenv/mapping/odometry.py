@@ -45,12 +45,11 @@ class PoseNoise:
             poses = _drifting(poses, self.drift, rng)
         scale = np.array([self.position, self.position, self.heading])
         step = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
-        kept = np.exp(-step / self.length)
+        correlation = np.exp(-step / self.length)
         error = np.empty((len(poses), 3))
         now = rng.normal(size=3)
-        for i, keep in enumerate(kept.tolist()):
-            now = keep * now + math.sqrt(max(0.0, 1.0 - keep * keep)) * rng.normal(size=3)
-            error[i] = now
+        for i, keep in enumerate(correlation.tolist()):
+            error[i] = now = keep * now + math.sqrt(max(0.0, 1.0 - keep * keep)) * rng.normal(size=3)
         return np.asarray(poses + scale * error)
 
 
@@ -70,7 +69,6 @@ def moved(start: FloatArray, motion: FloatArray) -> FloatArray:
 
 
 def _drifting(poses: FloatArray, drift: float, rng: np.random.Generator) -> FloatArray:
-    """Return the poses that drifting odometry adds up."""
     part = drift / math.sqrt(3.0)
     scale = 1.0 + part * rng.normal()
     bend = (

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -27,6 +28,8 @@ from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
+from parkenv.errors import require_one_of
+from parkenv.files.known_names import LOCALISERS
 from parkenv.mapping.odometry import between, moved
 from parkenv.perception.range_scan import RangeScan
 from parkenv.world.lot import Mouth, ParkingLot
@@ -36,13 +39,11 @@ LEAST_POINTS = 20  # of a scan that is matched
 SCAN_CELL, SUBMAP_CELL = (
     0.25,
     0.1,
-)  # m; one point of each cell is kept, of a scan to be fitted and of the points so far
+)  # m; one point of each cell stays, of a fitted scan and of the points so far
 SUBMAP_CAPTURES = 30  # captures whose points a scan is fitted to
 NEIGHBORS = 5  # points that make a line
 POINT_GATE = 0.5  # m, farthest point of a line
-POINT_SD = (
-    0.1  # m, of a point beside a line of the drive so far, with what errors of neighbours have in common
-)
+POINT_SD = 0.1  # m, of a point beside a line of the drive so far, with what neighbours' errors have in common
 ODOMETRY_SD = (0.05, 0.1, 0.02)  # of a step of odometry: m, m per m, and rad
 START_SD = (0.5, 0.5, math.radians(2.0))  # of the first pose: m, m, rad
 
@@ -66,12 +67,21 @@ class _Fit(NamedTuple):
     weight: FloatArray
 
 
-class ScanMatcher:
-    """Follows a car through one drive.
+Located = FloatArray | Callable[[Sequence[RangeScan]], FloatArray]
+"""A pose, or what `PerceptionPipeline.process` asks for it."""
 
-    Args:
-        lot: the lot, for its walls and slots.
-    """
+
+def make_locate(name: str, lot: ParkingLot) -> Callable[[FloatArray], Located]:
+    """Return a function that is called with the odometry of each capture of a drive, in order."""
+    require_one_of("localise", name, LOCALISERS)
+    if name == "none":
+        return lambda odometry: odometry
+    matcher = ScanMatcher(lot)
+    return lambda odometry: partial(matcher.locate, odometry)
+
+
+class ScanMatcher:
+    """Follows a car through one drive, past the walls and slots of a lot."""
 
     def __init__(self, lot: ParkingLot) -> None:
         self._edges = _lot_edges(lot)
@@ -83,9 +93,7 @@ class ScanMatcher:
     def locate(self, odometry: FloatArray, scans: Sequence[RangeScan]) -> FloatArray:
         """Return the pose of the vehicle, (3,) x, y in m and yaw in rad, lot frame.
 
-        Args:
-            odometry: (3,) the drifting pose; only its changes count, except for the first one.
-            scans: in the vehicle's frame.
+        Only changes of the odometry count, except for the first one. The scans are in the vehicle's frame.
         """
         points = np.concatenate([np.empty((0, 2)), *(_points(scan) for scan in scans)])
         sparse = _thinned(points, SCAN_CELL)
@@ -139,16 +147,10 @@ def _fitted(
     points: FloatArray,
     lines: Callable[[FloatArray, FloatArray], _Fit],
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit points to lines by Gauss-Newton steps.
+    """Fit points, (n, 2) m in the vehicle's frame, to lines by Gauss-Newton steps from a pose on.
 
-    Args:
-        prior: (3,) pose to begin at.
-        information: (3, 3) inverse covariance of the prior.
-        points: (n, 2) m, vehicle frame.
-        lines: the lines near points, (n, 2), of a vehicle at a pose.
-
-    Returns:
-        The pose, and its inverse covariance.
+    Return the pose, and its inverse covariance; `information` is that of the first one. `lines` returns the lines near
+    points of a vehicle at a pose.
     """
     pose, total = prior, information
     for _ in range(MOST_ITERATIONS if len(points) else 0):
@@ -234,7 +236,6 @@ def _lot_edges(lot: ParkingLot) -> _Edges:
 
 
 def _near_edges(edges: _Edges, pose: FloatArray) -> _Edges:
-    """Return the edges within reach of a vehicle."""
     away = pose[:2] - edges.start
     station = np.clip((away * edges.along).sum(axis=1), 0.0, edges.length)
     near = np.hypot(*(away - station[:, None] * edges.along).T) < REACH + 1.0
@@ -286,13 +287,11 @@ def _matched_edges(
 
 
 def _points(scan: RangeScan) -> FloatArray:
-    """Return the end points of a scan within reach, (n, 2), m."""
     with np.errstate(invalid="ignore"):
         return scan.points(np.flatnonzero(scan.distance < min(REACH, scan.max_range)))
 
 
 def _thinned(points: FloatArray, cell: float) -> FloatArray:
-    """Return the first point in each square cell."""
     if not len(points):
         return points
     cells = np.floor(points / cell).astype(np.int64)
@@ -302,7 +301,6 @@ def _thinned(points: FloatArray, cell: float) -> FloatArray:
 
 
 def _placed(points: FloatArray, pose: FloatArray) -> FloatArray:
-    """Return points of the vehicle's frame in the frame of its pose, (n, 2)."""
     return np.asarray(points @ _rotation(pose[2])[:2, :2].T + pose[:2])
 
 

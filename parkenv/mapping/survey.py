@@ -15,9 +15,9 @@ from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError, require_number, require_one_of, require_whole
 from parkenv.files.known_names import LOCALISERS
 from parkenv.mapping.grid import OccupancyGrid
-from parkenv.mapping.localisation import make_locate
 from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.route import SurveyRoute, survey_route
+from parkenv.mapping.scan_matching import make_locate
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey_score import SurveyScore, true_boxes
 from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_version
@@ -38,8 +38,6 @@ _SEEDS = 1 << 31
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """Settings of a survey."""
-
     # `laser`: the thesis's camera and 270° laser; `stereo`: only a stereo camera; `both_sides`: a laser, a camera to
     # the right and one to the left, so that aisles with slots on both sides are driven once
     rig: str = "laser"
@@ -70,8 +68,6 @@ class SurveySettings:
 
 @dataclass(frozen=True, eq=False)
 class SessionResult:
-    """A session, its estimates, and their errors."""
-
     session: Session  # the record for the map file
     arrival: Arrival  # start of the session
     states: SlotStates  # the filter's final estimate
@@ -150,9 +146,6 @@ class Survey:
         """Draw what determines the captures of a session: its cars, light, way and noise.
 
         Surveys that differ in their detectors, or in rigs with the same route, draw the same.
-
-        Args:
-            number: 0 or more; determines the session.
         """
         scenario, settings = self.scenario, self.settings
         key = world_key(settings.seed, number)
@@ -180,19 +173,43 @@ class Survey:
             pictures: number of results to keep for figures.
             on_frame: called after every capture.
         """
-        drive = self.draw(number)
-        session = _OpenSession(self, drive, number, pictures)
-        for i in range(len(drive.poses)):
-            frame = session.add(i, *drive.capture(i))
+        drive, lot = self.draw(number), self.scenario.lot
+        session, score = SessionMap(self.pipeline, lot, self.settings.localise), SurveyScore(lot.n_slots)
+        observed_at, poses = np.full(lot.n_slots, drive.arrival.time), np.empty_like(drive.odometry)
+        views, frame_s = [], []
+        shown: dict[
+            int, PerceptionResult
+        ] = {}  # for each section of the route, the capture with the most cars
+        for i, time in enumerate(drive.times.tolist()):
+            scene, capture = drive.capture(i)
+            session.slots.updated[:] = False
+            begun = clock.perf_counter()
+            result = session.add(TimedCapture(time, capture), drive.odometry[i])
+            frame_s.append(clock.perf_counter() - begun)
+            poses[i] = result.vehicle
+            views += [i] * len(result.views)
+            observed_at[session.slots.updated] = time
+            by_median = [localize_as_thesis(view, result.vehicle) for view in result.views]
+            score.add(scene, result, by_median, true_boxes(drive.rig, scene, capture))
+            section = i * pictures // len(drive.poses)
+            if pictures and (section not in shown or result.n_cars > shown[section].n_cars):
+                shown[section] = result
             if on_frame is not None:
-                on_frame(frame)
-        return session.result()
+                taken = drive.world.occupied(np.arange(lot.n_slots), time)
+                on_frame(SurveyFrame(result, session.grid, session.slots, taken, drive.odometry[i]))
+        truth = np.array(
+            [drive.world.occupied([s], t)[0] for s, t in enumerate(observed_at.tolist())], np.bool_
+        )
+        return SessionResult(
+            session.session(self.key_of(number), drive.arrival.time, self.settings.rig, drive.preset),
+            drive.arrival, session.slots.states(), truth, int(truth.sum()), int((truth & score.found).sum()), score,
+            drive.odometry, poses, drive.poses, np.repeat(np.array(views, np.int64), [len(c) for c in session.cars]),
+            np.array(frame_s), session.grid, tuple(shown.values()),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class SurveyDrive:
-    """The drive of a session, before anything is perceived."""
-
     rig: SensorRig
     scenes: LotScenes
     world: World  # the true occupancy
@@ -211,17 +228,7 @@ class SurveyDrive:
 
 
 class SessionMap:
-    """What a session maps: slots, the grid, and the located cars.
-
-    Args:
-        pipeline: processes the captures.
-        lot: the lot.
-        localise: what corrects the odometry, see `make_locate`.
-
-    Attributes:
-        slots, grid: the estimates so far.
-        cars: poses, (k, 3), of the cars that each camera has located in each capture so far.
-    """
+    """What a session maps so far: slots, the grid, and the poses of the cars that each view located, (k, 3) each."""
 
     def __init__(self, pipeline: PerceptionPipeline, lot: ParkingLot, localise: str) -> None:
         self._pipeline, self._locate = pipeline, make_locate(localise, lot)
@@ -239,7 +246,6 @@ class SessionMap:
         return result
 
     def session(self, key: str, time: float, rig: str, weather: str) -> Session:
-        """Return the record for the map file."""
         states = self.slots.states()
         p = np.where(states.in_view, states.p_occupied, np.nan)
         return Session(key, time, rig, weather, p, np.concatenate([np.empty((0, 3)), *self.cars]))
@@ -253,53 +259,3 @@ def _update_grid(grid: OccupancyGrid, view: CameraView, vehicle: FloatArray) -> 
     polar = np.column_stack([(bearing + np.pi) % (2 * np.pi) - np.pi, view.cars.distance])
     half_angle = float(np.arctan(view.camera.width / view.camera.fx / 2.0))
     grid.update((x, y), yaw, half_angle, polar)
-
-
-class _OpenSession:
-    """A session of one survey while it drives."""
-
-    def __init__(self, survey: Survey, drive: SurveyDrive, number: int, pictures: int) -> None:
-        lot = survey.scenario.lot
-        self._survey, self._drive, self._key, self._pictures = survey, drive, survey.key_of(number), pictures
-        self._map = SessionMap(survey.pipeline, lot, survey.settings.localise)
-        self._estimated = np.empty_like(drive.odometry)
-        self._score = SurveyScore(lot.n_slots)
-        self._observed_at = np.full(lot.n_slots, drive.arrival.time)
-        self._at: list[int] = []
-        self._frame_s: list[float] = []
-        # For each section of the route, the capture with the most cars.
-        self._shown: dict[int, PerceptionResult] = {}
-
-    def add(self, i: int, scene: Scene, capture: Capture) -> SurveyFrame:
-        """Process capture i; the true scene is only for figures and scores."""
-        drive, slots, time = self._drive, self._map.slots, float(self._drive.times[i])
-        slots.updated[:] = False
-        begun = clock.perf_counter()
-        result = self._map.add(TimedCapture(time, capture), drive.odometry[i])
-        self._estimated[i] = vehicle = result.vehicle
-        self._at += [i] * len(result.views)
-        self._frame_s.append(clock.perf_counter() - begun)
-        self._observed_at[slots.updated] = time
-        true = true_boxes(drive.rig, scene, capture)
-        self._score.add(scene, result, [localize_as_thesis(view, vehicle) for view in result.views], true)
-        section = i * self._pictures // len(drive.poses)
-        if self._pictures and (section not in self._shown or result.n_cars > self._shown[section].n_cars):
-            self._shown[section] = result
-        taken = drive.world.occupied(np.arange(len(self._observed_at)), time)
-        return SurveyFrame(result, self._map.grid, slots, taken, drive.odometry[i])
-
-    def result(self) -> SessionResult:
-        """Return the session after its last capture."""
-        drive, score = self._drive, self._score
-        truth = np.array(
-            [drive.world.occupied([s], t)[0] for s, t in enumerate(self._observed_at.tolist())],
-            dtype=np.bool_,
-        )
-        car_captures = np.repeat(np.array(self._at, dtype=np.int64), [len(c) for c in self._map.cars])
-        return SessionResult(
-            self._map.session(self._key, drive.arrival.time, self._survey.settings.rig, drive.preset),
-            drive.arrival, self._map.slots.states(), truth,
-            int(truth.sum()), int((truth & score.found).sum()), score,
-            drive.odometry, self._estimated, drive.poses, car_captures,
-            np.array(self._frame_s), self._map.grid, tuple(self._shown.values()),
-        )  # fmt: skip

@@ -44,14 +44,9 @@ def true_boxes(rig: SensorRig, scene: Scene, capture: Capture) -> TrueBoxes:
 class SurveyScore:
     """Counts over the captures of a session.
 
-    Args:
-        n_slots: number of slots of the lot.
-
-    Attributes:
-        found: (n_slots,) bool, whether the car in a slot was detected and assigned to a slot.
-        detections: number of detections; `right`: how many of them match a vehicle.
-        in_frame: (bins, 2) int64, by distance (`DISTANCE_ENDS`): how often a parked car was completely inside a frame
-            and mostly visible (`CLEAR`), and how often it was detected then.
+    `found`, (n_slots,), says whether the car in a slot was detected and assigned to a slot; `right` of the `detections`
+    match a vehicle; `in_frame`, (bins, 2), has by distance (`DISTANCE_ENDS`) how often a parked car was completely
+    inside a frame and mostly visible (`CLEAR`), and how often it was detected then.
     """
 
     def __init__(self, n_slots: int) -> None:
@@ -84,14 +79,7 @@ class SurveyScore:
         by_median: Sequence[LocatedCars],
         true: TrueBoxes,
     ) -> None:
-        """Count one capture.
-
-        Args:
-            scene: the true scene.
-            result: pipeline result for the capture.
-            by_median: for each view, its cars located by the thesis's method.
-            true: `true_boxes` of the capture.
-        """
+        """Count one capture, with its `true_boxes` and each view's cars located by the thesis's method."""
         pose = result.captured.capture.pose
         for view, median_cars in zip(result.views, by_median, strict=True):
             boxes = true[view.name]

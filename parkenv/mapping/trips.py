@@ -58,31 +58,20 @@ class Trip:
 
 @dataclass(frozen=True, eq=False)
 class SlotStates:
-    """What a trip says about the states of the k slots that it observed, each when it was first observed.
+    """What a trip says about the states of the k slots that it observed, each when it was first observed."""
 
-    Attributes:
-        slots: (k,) int64, in the order of their first observations.
-        time: (k,) float64, time of the first observation, on the clock of `Trip.time`.
-        likelihood: (k, 2) float64, probability of all observations of the slot if it was free then, and if it was
-            taken.
-    """
-
-    slots: NDArray[np.int64]
-    time: FloatArray
-    likelihood: FloatArray
+    slots: NDArray[np.int64]  # (k,) in the order of their first observations
+    time: FloatArray  # (k,) of the first observation, on the clock of `Trip.time`
+    likelihood: (
+        FloatArray  # (k, 2) probability of all observations if the slot was free then, and if it was taken
+    )
 
 
 def state_likelihoods(trip: Trip, forecast: Forecast) -> SlotStates:
     """Return what a trip says about each observed slot's state when it was first observed.
 
-    A slot changes between its observations as a two-state Markov chain with the forecast's decay rate.
-
-    Args:
-        trip: the trip.
-        forecast: the forecast of all slots for the trip.
-
-    Returns:
-        The states; slots with contradictory observations are left out.
+    A slot changes between its observations as a two-state Markov chain with the forecast's decay rate. Slots with
+    contradictory observations are left out.
     """
     slots, first = np.unique(trip.slots, return_index=True)
     slots, first = slots[np.argsort(first)], np.sort(first)
@@ -106,27 +95,16 @@ def state_likelihoods(trip: Trip, forecast: Forecast) -> SlotStates:
 class DayMemory:
     """When slots were observed on earlier trips of one day.
 
-    A slot that is taken on two trips may hold one car, not two. A later observation counts by the probability that
-    the slot has changed in between, 1 - exp(-decay rate · time). If the decay rate is wrong, the map is too sure or too
+    A slot that is taken on two trips may hold one car, not two. A later observation counts by the probability that the
+    slot has changed in between, 1 - exp(-decay rate · time). If the decay rate is wrong, the map is too sure or too
     unsure of the slot, but not biased, as it would be if changes themselves were modelled.
-
-    Args:
-        n_slots: number of slots.
     """
 
     def __init__(self, n_slots: int) -> None:
         self._time = np.full(n_slots, -np.inf)
 
     def add(self, states: SlotStates, forecast: Forecast) -> FloatArray:
-        """Add the states of a trip.
-
-        Args:
-            states: the states.
-            forecast: the forecast of all slots for the trip.
-
-        Returns:
-            (k,) float64, by how much each state counts, 0 to 1.
-        """
+        """Add the states of a trip; return by how much each counts, (k,), 0 to 1."""
         # Trips may overlap in time.
         apart = np.abs(states.time - self._time[states.slots])
         changed = 1.0 - np.exp(-np.minimum(forecast.decay_rate[states.slots] * apart, 700.0))

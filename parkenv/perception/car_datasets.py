@@ -25,16 +25,12 @@ _POSITIVE, _NEGATIVE = ("positives", "vehicles", "pos"), ("negatives", "non-vehi
 
 @dataclass(frozen=True, eq=False)
 class Crops:
-    """Aligned images of cars, and images without cars."""
-
     positives: list[Image]  # grey, uint8, with the car at the same position in each
     negatives: list[Image]  # grey, uint8, of any size
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledImage:
-    """A photograph with the boxes of its cars."""
-
     name: str  # name of the file
     image: Image  # (h, w) uint8
     boxes: FloatArray  # (n, 4) float64 px, left, top, right, bottom
@@ -54,12 +50,7 @@ def read_uiuc_training(folder: Path) -> Crops:
 
 
 def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
-    """Read one of UIUC's test sets, with the published true locations.
-
-    Args:
-        folder: the published `CarData`.
-        test_set: `single` or `multi`.
-    """
+    """Read a test set of UIUC's folder `CarData`, `single` or `multi`, with the published true locations."""
     require_one_of("test set", test_set, UIUC_TESTS)
     images, truth = (folder / name for name in UIUC_TESTS[test_set])
     if not truth.is_file():

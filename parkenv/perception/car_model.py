@@ -57,12 +57,10 @@ class CarModel:
             )
 
     def probability(self, score: Float32Array) -> Float32Array:
-        """Return P(car) of each score."""
         slope, offset = self.calibration
         return np.asarray(1.0 / (1.0 + np.exp(-(slope * score + offset))), dtype=np.float32)
 
     def scores(self, crops: NDArray[np.uint8]) -> Float32Array:
-        """Return the score of each of (n, height, width) uint8 grey windows."""
         flat = self.weights.reshape(-1)
         return np.array([self.descriptor.describe(c) @ flat + self.bias for c in crops], dtype=np.float32)
 

@@ -17,9 +17,8 @@ from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.errors import InputError
 from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, Crops, LabelledImage, read_uiuc_test
 from parkenv.perception.car_model import CarModel
-from parkenv.perception.car_regions import END_WIDEST
 from parkenv.perception.detector import Detections, Detector
-from parkenv.perception.hog_detector import HogDetector
+from parkenv.perception.hog_detector import END_WIDEST, HogDetector
 
 REACH = 0.25
 """Semi-axes of the ellipse around a true box, as fractions of its width and height (README of the UIUC set)."""
@@ -68,13 +67,9 @@ def recall_precision(
     *,
     scales: bool = True,
 ) -> RecallPrecision:
-    """Match detections to true boxes, best detection first, one per car, and return the curve.
+    """Match the detections of each image to its true boxes, best detection first, one per car, and return the curve.
 
-    Args:
-        boxes: for each image, (n, 4) left, top, right, bottom of the detections.
-        scores: for each image, (n,) scores of the detections.
-        truth: for each image, (m, 4) boxes of the cars.
-        scales: whether the width counts as a third axis, as in the multi-scale set.
+    With `scales` the width counts as a third axis, as in the multi-scale set.
     """
     cars = sum(len(t) for t in truth)
     hits, values = [], []
@@ -111,8 +106,6 @@ def matches(found: FloatArray, true: FloatArray, *, scales: bool = True) -> NDAr
 
 @dataclass(frozen=True, eq=False)
 class TestSetScore:
-    """Result on one test set: its row in `summary.json` and its curve."""
-
     row: dict[str, Any]
     curve: RecallPrecision
 
@@ -120,13 +113,7 @@ class TestSetScore:
 def score_on_uiuc(
     model: CarModel | Detector, folder: Path, *, on_image: Callable[[], None] = lambda: None
 ) -> list[TestSetScore]:
-    """Measure recall and precision on the UIUC test sets in a folder.
-
-    Args:
-        model: a side model, or any detector.
-        folder: the published folder `CarData`.
-        on_image: called after every image.
-    """
+    """Measure recall and precision of a side model, or any detector, on the test sets in UIUC's folder `CarData`."""
     sets = [name for name, (_, truth) in UIUC_TESTS.items() if (folder / truth).is_file()] or ["single"]
     return [score_on(model, read_uiuc_test(folder, name), name, on_image=on_image) for name in sets]
 

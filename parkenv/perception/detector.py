@@ -101,13 +101,9 @@ class DetectorErrors(NamedTuple):
     """
 
     missed: float = 0.05  # fraction of cars that are whole in a picture and hidden by no box
-    shift: tuple[float, float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )  # mean, fractions of the car's height in the image
-    std: tuple[float, float, float, float] = (0.06, 0.04, 0.06, 0.045)  # standard deviations, the same
+    # mean and standard deviations, fractions of the car's height in the image
+    shift: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    std: tuple[float, float, float, float] = (0.06, 0.04, 0.06, 0.045)
 
     def corrected(self, boxes: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return boxes, (n, 4), without their mean error."""
@@ -155,14 +151,9 @@ class GroundBand(NamedTuple):
     def of(
         cls, horizon: float, eye: float, off_ground: float, top: tuple[float, float], least_height: float
     ) -> GroundBand:
-        """Return the band of boxes whose lower edge is near the ground and whose upper edge has a car's height.
+        """Return the band of boxes whose lower edge is within `off_ground` of the ground, m, the upper at `top`.
 
-        Args:
-            horizon: px, row of the horizon.
-            eye: m, height of the camera.
-            off_ground: m, tolerance of the lower edge's height above or below the ground.
-            top: m, least and greatest height of the upper edge.
-            least_height: m, least difference of the two.
+        The camera is `eye` above the ground, m, and the two edges at least `least_height` apart.
         """
         most = (eye + off_ground) / max(top[0] + off_ground, least_height)
         return cls(horizon, (eye - off_ground) / (top[1] - off_ground), most)

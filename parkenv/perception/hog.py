@@ -1,4 +1,4 @@
-"""Histograms of oriented gradients (HOG): the thesis's descriptor, and two better normalizations.
+"""Histograms of oriented gradients (HOG): the thesis's descriptor, and a better normalization.
 
 The descriptor of a window consists of its cells (T §3.2.1): 8×8 pixels per cell, nine unsigned orientations, so 1152
 values for a side view of 128×64 and 2304 for a front of 128×128. Histograms are computed once per image; every window
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,12 +23,17 @@ from parkenv.errors import InputError, require_one_of
 
 CELL = 8  # pixels along each side of a cell
 ORIENTATIONS = 9  # bins over half a turn; opposite gradients count as one
-NORMALIZATIONS = ("neighbors", "cell", "blocks")
+NORMALIZATIONS = ("neighbors", "cell")
 
+_FAST: dict[str, Any] = {
+    "fastmath": {"nnan", "ninf", "nsz", "arcp", "contract", "afn"},
+    "error_model": "numpy",
+    "nogil": True,
+}
+_HALF = CELL // 2
 _NOISE = 25.0  # energy of a cell with sensor noise only; weaker cells are not amplified
 _CLIP = 0.2  # largest value of a single orientation (L2-Hys of Dalal and Triggs)
-_BLOCK = 2
-_ROOT = np.round(np.sqrt(255.0 * np.arange(256))).astype(np.uint8)
+_ROOT = np.round(np.sqrt(255.0 * np.arange(256))).astype(np.uint8)  # 255 stays 255
 
 
 @dataclass(frozen=True)
@@ -38,11 +44,10 @@ class Descriptor:
         width, height: size of the window, px; whole cells.
         normalization: `cell`: each cell by its own energy, with as many values as in the thesis. `neighbors`: each cell
             by the energies of the four blocks of 2×2 cells that contain it, averaged; the same number of values.
-            `blocks`: Dalal and Triggs (2005), each block of 2×2 cells separately, 36 values each.
 
     Examples:
-        >>> Descriptor(128, 64).size, Descriptor(128, 128).size, Descriptor(128, 64, "blocks").size
-        (1152, 2304, 3780)
+        >>> Descriptor(128, 64).size, Descriptor(128, 128).size
+        (1152, 2304)
     """
 
     width: int = 128
@@ -59,14 +64,10 @@ class Descriptor:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape of a window's features: rows, values per cell, columns."""
-        rows, columns = self.height // CELL, self.width // CELL
-        if self.normalization == "blocks":
-            return rows - 1, _BLOCK * _BLOCK * ORIENTATIONS, columns - 1
-        return rows, ORIENTATIONS, columns
+        return self.height // CELL, ORIENTATIONS, self.width // CELL
 
     @property
     def size(self) -> int:
-        """Number of values in a window's descriptor."""
         return math.prod(self.shape)
 
     def features(self, image: Image) -> Float32Array:
@@ -78,8 +79,8 @@ class Descriptor:
         Returns:
             (rows, values, columns) float32; columns come last, so that compiled loops run along them.
         """
-        normalize = {"cell": _by_cell, "neighbors": _by_neighbors, "blocks": _by_blocks}[self.normalization]
-        features: Float32Array = normalize(cell_histograms(rooted(image)))
+        cells = cell_histograms(cv2.LUT(_checked(image), _ROOT) if image.size else image)
+        features: Float32Array = _by_cell(cells) if self.normalization == "cell" else _by_neighbors(cells)
         return features
 
     def describe(self, crop: Image) -> Float32Array:
@@ -94,11 +95,6 @@ class Descriptor:
         wider = cv2.copyMakeBorder(crop, CELL, CELL, CELL, CELL, cv2.BORDER_REPLICATE)
         rows, _, columns = self.shape
         return np.ascontiguousarray(self.features(wider)[1 : 1 + rows, :, 1 : 1 + columns]).reshape(-1)
-
-
-def rooted(image: Image) -> Image:
-    """Take the square root of the grey values; 255 stays 255."""
-    return np.asarray(cv2.LUT(_checked(image), _ROOT)) if image.size else _checked(image)
 
 
 def _checked(image: Image) -> Image:
@@ -130,11 +126,7 @@ def cell_histograms(image: Image) -> Float32Array:
     return cells
 
 
-_FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn"}
-_HALF = CELL // 2
-
-
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(**_FAST)
 def _gradients(
     above: Image, row: Image, below: Image, magnitude: Float32Array, weighted_bin: Float32Array
 ) -> None:
@@ -162,13 +154,13 @@ def _gradients(
         weighted_bin[x] = m * (angle * one_bin - np.float32(0.5))
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(**_FAST)
 def _share(m: np.float32, q: np.float32, k: np.float32) -> np.float32:
     """Return the weight of a gradient in bin k: its magnitude, falling linearly with the distance in bins."""
     return max(np.float32(0.0), m - abs(q - m * k))
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(**_FAST)
 def _bin_rows(
     m: Float32Array, q: Float32Array, first: np.float32, upper: Float32Array, lower: Float32Array
 ) -> None:
@@ -200,7 +192,7 @@ def _bin_rows(
             b[_HALF + x] += down
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(**_FAST)
 def _pool(sums: Float32Array, tent: Float32Array, out: Float32Array) -> None:
     """Sum columns of pixels to columns of cells, with a triangular window two cells wide."""
     for k in range(ORIENTATIONS):
@@ -211,9 +203,8 @@ def _pool(sums: Float32Array, tent: Float32Array, out: Float32Array) -> None:
             out[k, c] = total
 
 
-@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
+@compiled(**_FAST)
 def _histograms(padded: Image, rows: int, columns: int) -> Float32Array:
-    """`cell_histograms` of an image with a border of one pixel."""
     width = columns * CELL
     out = np.zeros((rows, ORIENTATIONS, columns), dtype=np.float32)
     upper = np.zeros((ORIENTATIONS, _HALF + width + _HALF), dtype=np.float32)
@@ -242,7 +233,7 @@ def _histograms(padded: Image, rows: int, columns: int) -> Float32Array:
     return out
 
 
-@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
+@compiled(**_FAST)
 def _by_cell(cells: Float32Array) -> Float32Array:
     rows, values, columns = cells.shape
     out = np.empty_like(cells)
@@ -260,7 +251,7 @@ def _by_cell(cells: Float32Array) -> Float32Array:
     return out
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(**_FAST)
 def _block_scales(cells: Float32Array) -> Float32Array:
     """Return 1/norm of the 2×2 cells around each corner, (rows + 1, columns + 1); border cells count twice."""
     rows, values, columns = cells.shape
@@ -281,7 +272,7 @@ def _block_scales(cells: Float32Array) -> Float32Array:
     return scale
 
 
-@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
+@compiled(**_FAST)
 def _by_neighbors(cells: Float32Array) -> Float32Array:
     rows, values, columns = cells.shape
     scale = _block_scales(cells)
@@ -299,31 +290,7 @@ def _by_neighbors(cells: Float32Array) -> Float32Array:
     return out
 
 
-@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
-def _by_blocks(cells: Float32Array) -> Float32Array:
-    rows, values, columns = cells.shape
-    out = np.empty((max(rows - 1, 0), 4 * values, max(columns - 1, 0)), dtype=np.float32)
-    scale = _block_scales(cells)
-    clip = np.float32(_CLIP)
-    norm = np.empty(max(columns - 1, 0), dtype=np.float32)
-    for y in range(rows - 1):
-        norm[:] = 1e-6
-        for corner in range(4):
-            dy, dx = corner // 2, corner % 2
-            for k in range(values):
-                for x in range(columns - 1):
-                    v = min(cells[y + dy, k, x + dx] * scale[y + 1, x + 1], clip)
-                    out[y, corner * values + k, x] = v
-                    norm[x] += v * v
-        for x in range(columns - 1):
-            norm[x] = np.float32(1.0) / math.sqrt(norm[x])
-        for k in range(4 * values):
-            for x in range(columns - 1):
-                out[y, k, x] *= norm[x]
-    return out
-
-
-@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
+@compiled(**_FAST)
 def correlate(features: Float32Array, weights: Float32Array) -> Float32Array:
     """Correlate: the dot product of the weights with every window of the features.
 

@@ -8,23 +8,53 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Float32Array, Image
+from parkenv.compiled.arrays import Float32Array, FloatArray, Image
 from parkenv.compiled.threads import in_threads
 from parkenv.errors import InputError, require_number
 from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
 from parkenv.perception.detector import Detections, DetectorErrors, GroundBand
 from parkenv.perception.hog import CELL, Descriptor, correlate
 
+END_BELOW = 1.8  # width over height of a box below which it shows a front or rear
+END_WIDEST = (
+    2.0  # width over height of a box above which no long lens shows a car's whole front or rear in it
+)
 LEAST_SCORED = 0.002
 """Least probability of a detection that counts in an evaluation: curves go on to many false positives."""
 _ZOOM = 1.6
 _MOST_WINDOWS = 2000  # only the best are kept; a useful model does not report more
+
+
+class CarWindow(NamedTuple):
+    """The window of a HOG model, in which a car always stands at the same place.
+
+    Attributes:
+        car: left, top, right, bottom of the car, as fractions of the window.
+        aspect: width over height of the image region that is resized to the window.
+        size: width and height of the window, px.
+    """
+
+    car: tuple[float, float, float, float]
+    aspect: float
+    size: tuple[int, int]
+
+    def region(self, box: FloatArray) -> FloatArray:
+        """Return the image region of a window that is aligned to a car's box: (4,) px, left, top, right, bottom."""
+        width = (box[2] - box[0]) / (self.car[2] - self.car[0])
+        height = width / self.aspect
+        left = box[0] - self.car[0] * width
+        top = box[3] - self.car[3] * height
+        return np.array([left, top, left + width, top + height])
+
+
+SIDE = CarWindow((0.08, 0.22, 0.92, 0.885), 2.5, (128, 64))  # a car from its side, as in UIUC's crops
+END = CarWindow((0.08, 0.12, 0.92, 0.92), 1.0, (128, 128))  # a front or rear
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +130,7 @@ class HogDetector:
         return self._best(as_grey(image), None)
 
     def detect_on_ground(self, image: Image, band: GroundBand) -> Detections:
-        """Find the cars whose boxes lie in a band; the rows of the image that cannot have one are not looked at.
-
-        Args:
-            image: as for `detect`.
-            band: where the boxes lie.
-        """
+        """Find the cars whose boxes lie in a band; the rows of the image that cannot have one are not looked at."""
         return self._best(as_grey(image), band)
 
     def _best(self, grey: Image, band: GroundBand | None) -> Detections:
@@ -121,13 +146,7 @@ class HogDetector:
         )
 
     def scan(self, model: CarModel, grey: Image, band: GroundBand | None = None) -> Detections:
-        """Return all windows above the threshold, before non-maximum suppression.
-
-        Args:
-            model: one of the models.
-            grey: (h, w) uint8.
-            band: where the boxes lie; None: anywhere.
-        """
+        """Return all windows above the threshold, before non-maximum suppression."""
         height, width = grey.shape
         most = self.most_height or max(height, width / model.region_aspect) * (1.0 + 2.0 * self.margin)
         window = model.descriptor
@@ -175,7 +194,6 @@ class HogDetector:
 
 
 def _region_tops(model: CarModel, region_height: float, band: GroundBand) -> tuple[float, float]:
-    """Return the first and last row, px, at which a region may begin if its car lies in the band."""
     _, top, _, bottom = model.car
     height = (bottom - top) * region_height
     below = band.horizon - bottom * region_height
@@ -191,7 +209,6 @@ def _features_of_rows(window: Descriptor, level: Image, first: int, end: int) ->
 
 
 def as_grey(image: Image) -> Image:
-    """Return the image as (h, w) uint8."""
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise InputError(f"image is {image.shape} of {image.dtype}, want (h, w) or (h, w, 3) uint8")
     if image.size == 0:
@@ -209,13 +226,7 @@ def best_boxes(
     """Suppress non-maxima: return the rows of the boxes that no better box claims for its own car, best first.
 
     A box that is much smaller or larger than a better one has little of its union in common with it: a wheel in a car
-    counts as another car by `overlap`, but not by `inside`.
-
-    Args:
-        boxes: (n, 4) left, top, right, bottom.
-        value: (n,) score of each.
-        overlap: largest intersection over union of two boxes that are kept.
-        inside: largest intersection over the area of the smaller one.
+    counts as another car by `overlap` (intersection over union), but not by `inside` (over the area of the smaller).
     """
     order = np.argsort(-value, kind="stable")[:_MOST_WINDOWS]
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])

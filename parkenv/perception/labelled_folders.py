@@ -19,8 +19,7 @@ from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
 from parkenv.files.limited_reading import is_there, read_json, read_text, read_yaml
 from parkenv.files.spec_file import Several, Spec
 from parkenv.perception.car_datasets import Crops, LabelledImage
-from parkenv.perception.car_regions import END, END_BELOW, SIDE
-from parkenv.perception.hog_detector import as_grey
+from parkenv.perception.hog_detector import END, END_BELOW, SIDE, as_grey
 from parkenv.perception.training import cut_out
 
 Box = tuple[float, float, float, float]
@@ -66,8 +65,6 @@ class _Coco(Spec, extra="ignore"):
 
 @dataclass(frozen=True, eq=False)
 class LabelledPhoto:
-    """A picture and the boxes of its cars."""
-
     labelled: LabelledImage  # the grey picture, with the boxes of all cars
     single: NDArray[np.bool_]  # (n,) bool, whether a box is one car, not a crowd of them
 
@@ -161,15 +158,15 @@ def crops_of(
             if inside and size[0] >= LEAST_WIDTH and (size[0] < END_BELOW * size[1]) == end_on:
                 region = car.region(box)
                 shape = (max(round(region[2] - region[0]), 8), max(round(region[3] - region[1]), 8))
-                positives.append(cut_out(image, region, shape))
+                positives.append(cut_out(image, region.tolist(), shape))
         for _ in range(_WINDOWS):
             window = rng.uniform(0.15, 0.6) * min(height, width / car.aspect)
             window_size = np.array([car.aspect * window, window])
             at = rng.uniform(0.0, 1.0, 2) * (np.array([width, height]) - window_size)
             low, high = boxes[:, :2] - at, boxes[:, 2:] - at
             if window >= 16.0 and not ((low < window_size) & (high > 0.0)).all(axis=1).any():
-                region = np.concatenate([at, at + window_size])
-                negatives.append(cut_out(image, region, (round(window_size[0]), round(window))))
+                place = [*at, *(at + window_size)]
+                negatives.append(cut_out(image, place, (round(window_size[0]), round(window))))
     if len(positives) < LEAST_CARS or not negatives:
         seen = "from the front or rear" if end_on else "from the side"
         raise InputError(
@@ -204,7 +201,6 @@ def _photo(
 
 
 def _cars(names: dict[Any, str], classes: Sequence[str], source: Path) -> set[Any]:
-    """Return the classes that are cars."""
     for wanted in classes:
         if wanted not in names.values():
             raise InputError(f"{source}: has no class {wanted!r}; {nearest(wanted, names.values())}")
@@ -221,7 +217,6 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _yolo_names(folder: Path) -> dict[Any, str]:
-    """Return the names of the classes of a folder in YOLO's format."""
     data, plain = folder / "data.yaml", folder / "classes.txt"
     if plain.is_file() and not data.is_file():
         return dict(enumerate(line.strip() for line in read_text(plain).splitlines() if line.strip()))

@@ -116,17 +116,9 @@ class GroundView(NamedTuple):
 def distances_ahead(
     boxes: FloatArray, view: NDArray[np.int8], ground: GroundView, errors: RangingErrors
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return how far ahead of the camera the nearest sides of cars are.
+    """Return how far ahead of the camera the nearest sides of cars are, (n,) m, and their standard deviations.
 
-    Args:
-        boxes: (n, 4) px.
-        view: (n,) a `View` each.
-        ground: the camera above the ground.
-        errors: standard deviations.
-
-    Returns:
-        (n,) m; their standard deviations, (n,) m; and whether ground and height agree, on ground within `REACH`, (n,)
-        bool.
+    And whether ground and height agree, on ground within `REACH`, (n,) bool.
     """
     camera, mount = ground.camera, ground.mount
     usual, none = UsualCars.seen_as(view), np.zeros(len(boxes))
@@ -191,13 +183,8 @@ def localize_boxes(
     nearer one hides, those that end above the horizon, and those whose height and lower edge do not agree: a car on
     the ground in front of the camera has no such box.
 
-    Args:
-        detections: detections in the camera's image.
-        ground: the camera above the ground.
-        vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
-        errors: standard deviations.
-        heading_near: returns the heading, rad, that a car parked near each of (n, 2) points has, NaN for none; None
-            takes that of the view, along or across the line of sight.
+    Cars have the headings, rad, that `heading_near` returns for (n, 2) points; where it returns NaN, or is None, that
+    of the view, along or across the line of sight.
     """
     boxes, camera = errors.detector.corrected(detections.boxes), ground.camera
     if not len(boxes):
@@ -251,11 +238,7 @@ def localize_boxes(
 
 
 def corners_of_cars(heading: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far the corners of usual cars, (n, 4), are ahead of their centres and to the right of them, m.
-
-    Args:
-        heading: (n,) rad, counter-clockwise from ahead.
-    """
+    """Return how far the corners of usual cars, (n, 4), are ahead of their centres and to the right of them, m."""
     c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
     length, width = 0.5 * CAR_LENGTH * np.array([1, 1, -1, -1]), 0.5 * CAR_WIDTH * np.array([1, -1, 1, -1])
     return c * length - s * width, -s * length - c * width

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -16,13 +19,28 @@ from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
-from parkenv.perception.car_regions import END, END_BELOW, END_WIDEST, SIDE
 from parkenv.perception.detector import LEAST_PROBABILITY, Detections
-from parkenv.perception.hog_detector import as_grey, best_boxes
-from parkenv.perception.onnx_trial import require_runs
+from parkenv.perception.hog_detector import END, END_BELOW, END_WIDEST, SIDE, as_grey, best_boxes
 
-MAX_ONNX_BYTES = 256_000_000
-"""Maximum size of an ONNX file."""
+MAX_ONNX_BYTES = 256_000_000  # maximum size of an ONNX file
+LONGEST_S, MOST_BYTES = 120, 8 << 30
+"""Maximum time and address space of the process that tries an unknown network; Windows knows no such limit."""
+_TRIAL = f"""
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, ({MOST_BYTES}, {MOST_BYTES}))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except (ImportError, OSError, ValueError):
+    pass
+import sys
+import cv2, numpy
+shape = [int(word) for word in sys.argv[1:]]
+cv2.setNumThreads(1)
+net = cv2.dnn.readNetFromONNX(numpy.frombuffer(sys.stdin.buffer.read(), numpy.uint8))
+net.setInput(numpy.full(shape, 0.5, numpy.float32))
+net.forward(list(net.getUnconnectedOutLayersNames()))
+"""
+_passed: set[tuple[str, tuple[int, ...]]] = set()
 _COCO = {1: (0,), 80: (2, 5, 7)}
 """Cars by the number of classes: the only one, or COCO's car, bus and truck."""
 _BORDER = 114  # grey level around an image in the input
@@ -83,7 +101,6 @@ class Candidates(NamedTuple):
     visible: Float32Array | None = None  # (n,) visible fraction
 
     def select(self, rows: NDArray[Any]) -> Candidates:
-        """Return some of the candidates, by index or by mask."""
         return Candidates(*(None if values is None else values[rows] for values in self))  # type: ignore[arg-type]
 
 
@@ -190,7 +207,6 @@ class OnnxDetector:
         )  # fmt: skip
 
     def _run(self, fed: Float32Array) -> Float32Array:
-        """Return the output for an input, (1, channels, height, width)."""
         threads, level = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
         cv2.setNumThreads(1)
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -213,7 +229,6 @@ class OnnxDetector:
         return outputs[0]
 
     def _classes_of_cars(self, shape: Sequence[int]) -> tuple[int, ...]:
-        """Return the classes of an output of the layout yolo that are cars."""
         # There are more candidates than numbers of one; others have a candidate in each row.
         if len(shape) != 3 or shape[0] != 1 or not 4 < shape[1] <= shape[2]:
             raise InputError(
@@ -233,8 +248,28 @@ class OnnxDetector:
         return cars
 
 
+def require_runs(data: bytes, name: str, shape: tuple[int, ...]) -> None:
+    """Check in another process, once for each network, that OpenCV runs it: it does not survive every damaged file."""
+    key = hashlib.sha256(data).hexdigest(), shape
+    if key in _passed:
+        return
+    # -I: the process finds installed packages, and nothing in the working folder.
+    command = [sys.executable, "-I", "-c", _TRIAL, *map(str, shape)]
+    try:
+        done = subprocess.run(command, input=data, capture_output=True, timeout=LONGEST_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise InputError(f"{name}: takes more than {LONGEST_S} s for an image of shape {shape}") from error
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").strip().splitlines()
+        # An exception ends with 1, a crash with a signal.
+        reason = lines[-1] if lines and done.returncode == 1 else "it crashes; is the file whole?"
+        raise InputError(
+            f"{name}: OpenCV cannot run this network with an input of shape {shape}: {reason:.300}"
+        )
+    _passed.add(key)
+
+
 def sidecar_of(path: str | Path) -> Path:
-    """Return the settings' file beside a network, which may be missing."""
     return Path(path).with_suffix(".toml")
 
 

@@ -68,8 +68,6 @@ class CameraView:
 
 
 class _Seen(NamedTuple):
-    """What the images of a capture show, before any range is known."""
-
     detections: dict[str, Detections]  # by camera
     disparities: dict[str, tuple[StereoCamera, NDArray[np.float32]]]  # by stereo camera, eq. 3.1
 
@@ -85,7 +83,6 @@ class PerceptionResult:
 
     @property
     def n_cars(self) -> int:
-        """Number of located cars."""
         return sum(len(view.cars) for view in self.views)
 
 
@@ -182,10 +179,8 @@ class PerceptionPipeline:
             The result of each capture, and the observed slots with their states.
         """
         slots = SlotFilter(self.lot)
-        seen = in_threads(self._look, captures) if self._concurrent else [self._look(c) for c in captures]
-        results = tuple(
-            self._process(captured, one, slots) for captured, one in zip(captures, seen, strict=True)
-        )
+        seen = in_threads(self._look, captures) if self._concurrent else map(self._look, captures)
+        results = tuple(self._process(*pair, slots) for pair in zip(captures, seen, strict=True))
         return results, slots.observation()
 
     def _look(self, captured: TimedCapture) -> _Seen:
@@ -214,7 +209,6 @@ class PerceptionPipeline:
         return self.detector.detect_on_ground(image, band)
 
     def _ranging_sensor(self, camera: str) -> str:
-        """Return the name of the sensor whose ranges locate the detections of a camera."""
         if self.rig.lasers:
             return self.rig.lasers[0][0]
         stereo_cameras = [name for name, _, _ in self.rig.stereo_cameras]
@@ -255,12 +249,7 @@ class PerceptionPipeline:
 
 
 def localize_as_thesis(view: CameraView, vehicle: FloatArray) -> LocatedCars:
-    """Locate the detections of a view as the thesis does, for comparison: by the median range in each box (T §3.2.3).
-
-    Args:
-        view: view of a `PerceptionResult`.
-        vehicle: (3,) estimated x, y, yaw of the vehicle, world frame.
-    """
+    """Locate the detections of a view as the thesis does, by the median range in each box (T §3.2.3), to compare."""
     if view.stereo is not None:
         stereo, disparity_px = view.stereo
         return localize_disparity(view.detections, disparity_px, stereo, view.mount, vehicle)

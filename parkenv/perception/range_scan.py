@@ -56,14 +56,7 @@ class RangeScan:
 def scan_from_laser(
     laser: LaserScanner, mount: Mount, vehicle: FloatArray, ranges: Float32Array
 ) -> RangeScan:
-    """Convert the ranges of a laser scanner to the world frame.
-
-    Args:
-        laser: the scanner.
-        mount: its pose on the vehicle.
-        vehicle: (3,) estimated x, y in m and yaw in rad of the vehicle, world frame.
-        ranges: (n_beams,) float32, m; inf for beams without a return.
-    """
+    """Convert the ranges of a laser scanner, (n_beams,) m, inf without a return, to the world frame."""
     if ranges.shape != (laser.n_beams,):
         raise InputError(f"scan has shape {ranges.shape}, want ({laser.n_beams},)")
     if np.isnan(ranges).any() or (ranges < 0.0).any():
@@ -78,13 +71,7 @@ def scan_from_stereo(
 ) -> RangeScan:
     """Find the nearest obstacle at bumper height in every few columns of a disparity image.
 
-    A direction in which only ground is visible is free; a direction without matches is unknown.
-
-    Args:
-        stereo: the camera.
-        mount: pose of its left camera on the vehicle; without pitch.
-        vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
-        disparity_px: (h, w) float32, px, NaN where nothing matches; see `disparity`.
+    A direction in which only ground is visible is free, one without matches unknown. The camera has no pitch.
     """
     camera = stereo.camera
     x, y, yaw = mount.in_world(vehicle)
@@ -105,12 +92,7 @@ def scan_from_stereo(
 
 
 def disparity(pair: StereoFrame, stereo: StereoCamera) -> Float32Array:
-    """Compute the disparity, (h, w) float32 px, by OpenCV's semi-global matching; NaN where it finds no match.
-
-    Args:
-        pair: rectified images.
-        stereo: the camera.
-    """
+    """Compute the disparity, (h, w) float32 px, by OpenCV's semi-global matching; NaN where it finds no match."""
     most = 16 * math.ceil(stereo.camera.fx * stereo.baseline / _NEAREST / 16)
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,

@@ -40,8 +40,6 @@ _SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 
 @dataclass(frozen=True, eq=False)
 class LocatedCars:
-    """Detected cars in the world frame."""
-
     xy: FloatArray  # (n, 2) float64, m, centres, world frame
     yaw: FloatArray  # (n,) float64, rad, along the car, in [0, π): front and rear are not distinguished
     size: FloatArray  # (n, 2) float64, m, length and width
@@ -70,7 +68,6 @@ class LocatedCars:
 
     @classmethod
     def none(cls) -> LocatedCars:
-        """Return an object without cars."""
         return cls(
             np.empty((0, 2)), np.empty(0), np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.float32),
             np.empty(0, dtype=np.int64),
@@ -78,7 +75,6 @@ class LocatedCars:
 
     @property
     def poses(self) -> FloatArray:
-        """(n, 3) float64, x, y, yaw."""
         return np.column_stack([self.xy, self.yaw])
 
 
@@ -103,8 +99,6 @@ def median_distance(scan: RangeScan, beams: NDArray[np.int64]) -> float:
 
 
 class CarBeams(NamedTuple):
-    """The beams that end on a car."""
-
     beams: NDArray[np.int64]  # (k,) int64, counter-clockwise; empty if none ends on a car
     # whether the car extends beyond the first and beyond the last of them, where it is occluded or outside the
     # sensor's field of view
@@ -151,8 +145,15 @@ def car_beams(
 
 def median_depth(disparity_px: Float32Array, box: Float32Array, stereo: StereoCamera) -> float:
     """Return the thesis's depth of a box, m: the median of fB/d in it (eq. 3.1); NaN if nothing matches."""
-    depth = _depths(disparity_px, box, stereo)
-    return float(np.median(depth)) if len(depth) else math.nan
+    left, top, right, bottom = box.astype(np.float64)
+    rows, columns = disparity_px.shape
+    u = np.clip(np.round([left, right]), 0, columns).astype(int)
+    v = np.clip(np.round([top, bottom]), 0, rows).astype(int)
+    matches = disparity_px[v[0] : v[1], u[0] : u[1]]
+    matches = matches[np.isfinite(matches)]
+    if not len(matches):
+        return math.nan
+    return float(np.median(np.asarray(stereo.camera.fx * stereo.baseline / matches, dtype=np.float64)))
 
 
 def localize_cars(
@@ -163,14 +164,8 @@ def localize_cars(
     The following detections are dropped: those without an obstacle at bumper height; those that, at its distance, would
     not be on the ground or have a car's height; those whose beams end on the nearer car of another box, which hides
     them, or is the same; and cars too hidden to estimate their orientation, with neither a side nor an end visible, or
-    only a part of one at the image border. Later captures show them better.
-
-    Args:
-        detections: detections in the camera's image.
-        scan: ranges from the same vehicle pose.
-        camera: the camera that took the image.
-        mount: its pose on the vehicle, on the same vertical axis as the ranging sensor.
-        vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
+    only a part of one at the image border. Later captures show them better. Camera and ranging sensor are on one
+    vertical axis.
     """
     _require_same_axis(scan, mount, vehicle)
     rows, cars, distances = [], [], []
@@ -213,10 +208,7 @@ def localize_cars(
 def localize_median(
     detections: Detections, scan: RangeScan, camera: PinholeCamera, mount: Mount, vehicle: FloatArray
 ) -> LocatedCars:
-    """Locate the detected cars as the thesis does: directly behind the median of all beams in the box (eq. 3.2).
-
-    Arguments and errors are those of `localize_cars`.
-    """
+    """Locate the detected cars as the thesis does: directly behind the median of all beams in the box (eq. 3.2)."""
     _require_same_axis(scan, mount, vehicle)
     margins = bearings(camera, mount, vehicle, detections.boxes)
     distance = [median_distance(scan, beams_between(scan, left, right)) for left, right in margins]
@@ -232,12 +224,7 @@ def localize_disparity(
 ) -> LocatedCars:
     """Locate the detected cars as the thesis does with a stereo camera: directly behind the median depth of the box.
 
-    Args:
-        detections: detections in the left camera's image.
-        disparity_px: (h, w) float32, px, NaN where nothing matches.
-        stereo: the camera.
-        mount: pose of its left camera on the vehicle.
-        vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
+    The detections are in the left camera's image; `disparity_px` is NaN where nothing matches.
     """
     x, y, yaw = mount.in_world(vehicle)
     margins = bearings(stereo.camera, mount, vehicle, detections.boxes)
@@ -288,8 +275,7 @@ def _is_on_ground(box: Float32Array, distance: float, camera: PinholeCamera, mou
 def _hidden(distance: FloatArray) -> bool:
     """Return whether a car may extend behind a nearer obstacle beside it, or beyond the last beam.
 
-    Args:
-        distance: (k,) m, of the car's last beam and of those after it, outwards.
+    `distance`, (k,) m, is of the car's last beam and of those after it, outwards.
     """
     # The next beam may have dropped out, so check the one after it, too.
     after = distance[1:3]
@@ -300,15 +286,4 @@ def _hidden(distance: FloatArray) -> bool:
 
 
 def _wrapped(angle: FloatArray) -> FloatArray:
-    """Wrap angles to [-π, π)."""
     return np.asarray((angle + math.pi) % (2.0 * math.pi) - math.pi)
-
-
-def _depths(disparity_px: Float32Array, box: Float32Array, stereo: StereoCamera) -> FloatArray:
-    """Return the depths of all matches in a box, m."""
-    left, top, right, bottom = box.astype(np.float64)
-    rows, columns = disparity_px.shape
-    u = np.clip(np.round([left, right]), 0, columns).astype(int)
-    v = np.clip(np.round([top, bottom]), 0, rows).astype(int)
-    found = disparity_px[v[0] : v[1], u[0] : u[1]]
-    return np.asarray(stereo.camera.fx * stereo.baseline / found[np.isfinite(found)], dtype=np.float64)

@@ -23,32 +23,22 @@ from parkenv.world.lot import Mouth, ParkingLot
 P_FREE, P_OCCUPIED, P_PRIOR = 0.45, 0.95, 0.5  # the observation model of eq. 3.9.
 CORE = (0.8, 0.45)  # half the length and width, m, of the core of a slot, which every parked car covers
 MARGIN = 0.35  # m; a parked car may extend out of its slot towards the lane by this much
-INSET = 0.1
-"""m; beams must end this far inside the lines to the neighbours, whose cars may stand close to them."""
-SCAN_LOG_ODDS = 1.2
-"""Evidence of one scan that crosses the core of a slot (negative) or ends within the slot (positive)."""
-MOST_LOG_ODDS = 4.0
-"""Bound of the log-odds of a slot, so that the filter notices a car that arrives or leaves during the drive."""
-PARKED = (0.35, 0.2)
-"""Standard deviation of a parked car's place along and across its slot, m."""
-ELSEWHERE = 0.01
-"""Density of cars outside slots, 1/m²: traffic, and boxes without a car."""
-LEAST_SHARE = 0.5
-"""Probability that an observation is of a slot, from which it counts."""
-VIEW_REACH = 12.0
-"""m, up to which a slot without a car in the picture is held to be free."""
+INSET = 0.1  # m; beams must end this far inside the lines to the neighbours, whose cars may be close
+SCAN_LOG_ODDS = 1.2  # of a scan whose beams cross a slot's core (negative) or end within it (positive)
+MOST_LOG_ODDS = 4.0  # bound of a slot's log-odds: a car that arrives or leaves during the drive is noticed
+PARKING_SPREAD_M = (0.35, 0.2)  # standard deviation of a parked car's place along and across its slot, m
+CLUTTER_DENSITY = 0.01  # cars outside slots, 1/m²: traffic, and boxes without a car
+LEAST_ASSIGNMENT = 0.5  # probability that an observation is of a slot, from which it counts
+VIEW_REACH_M = 12.0  # m, up to which a slot without a car in the picture is held to be free
 _CANDIDATES = 8  # slots that a car may stand in
-_KNOWN_FREE = 0.5  # log-odds
-_WHOLE = 0.85  # of a car's height that a picture must show
-_COVERED = 0.15  # of a place, from which a box hides it
-_LEAST_BEAMS = 4
-_CLEAR = 0.6
+_FREE_LOG_ODDS = 0.5  # against taken, from which a slot is known to be free
+_SHOWN_HEIGHT = 0.85  # fraction of a car's height that a picture must show
+_OCCLUDED = 0.15  # fraction of a slot's place in the picture from which a box hides it
+_LEAST_BEAMS, _BEAM_MAJORITY = 4, 0.6
 
 
 @dataclass(frozen=True, eq=False)
 class SlotStates:
-    """The estimated occupancy of every slot."""
-
     p_occupied: FloatArray  # (n_slots,) float64; 0.5 where nothing was observed
     in_view: NDArray[np.bool_]  # (n_slots,) bool, whether there was any evidence about the slot
 
@@ -66,7 +56,6 @@ class SlotObservation(NamedTuple):
 
     @classmethod
     def none(cls) -> SlotObservation:
-        """Return an observation of no slot."""
         return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
 
 
@@ -118,15 +107,15 @@ class SlotFilter:
         ranks = list(range(1, min(_CANDIDATES, self.lot.n_slots) + 1))
         near = np.asarray(self._tree.query(cars.xy, k=ranks)[1], dtype=np.int64)
         yaw, away = self.lot.slot_yaw[near], self.lot.slot_xy[near] - cars.xy[:, None]
-        axes = np.stack([np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)], axis=-1) * np.array(PARKED * 2)
-        axes = axes.reshape(*near.shape, 2, 2)
+        axes = np.stack([np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)], axis=-1)
+        axes = (axes * np.array(PARKING_SPREAD_M * 2)).reshape(*near.shape, 2, 2)
         spread = cars.covariance[:, None] + axes @ axes.swapaxes(-1, -2)
         off = (away * np.linalg.solve(spread, away[..., None])[..., 0]).sum(axis=-1)
         density = np.exp(-0.5 * off) / (2.0 * math.pi * np.sqrt(np.linalg.det(spread)))
-        share = density / (density.sum(axis=1, keepdims=True) + ELSEWHERE)
+        share = density / (density.sum(axis=1, keepdims=True) + CLUTTER_DENSITY)
         best = np.arange(len(cars)), share.argmax(axis=1)
         likely = share[best] * cars.probability.astype(np.float64)
-        return np.where(likely > LEAST_SHARE, near[best], -1).astype(np.int64), likely
+        return np.where(likely > LEAST_ASSIGNMENT, near[best], -1).astype(np.int64), likely
 
     def update_from_cars(self, cars: LocatedCars) -> IntArray:
         """Update the slots of the cars in one image; return `slots_of(cars)`.
@@ -139,29 +128,23 @@ class SlotFilter:
         sure = np.zeros(self.lot.n_slots)
         np.maximum.at(sure, there, likely[slots >= 0])
         there = np.unique(there)
-        doubted = _logit(P_PRIOR + sure[there] * (P_OCCUPIED - P_PRIOR))
-        self.log_odds[there] += _logit(P_OCCUPIED) if cars.covariance is None else doubted
-        self.in_view[there] = self.updated[there] = True
-        self._clip()
+        p = P_OCCUPIED if cars.covariance is None else P_PRIOR + sure[there] * (P_OCCUPIED - P_PRIOR)
+        self._add(there, np.broadcast_to(_logit(p), there.shape))
         return slots
 
     def update_from_scan(self, scan: RangeScan) -> None:
         """Update the slots whose core beams cross: taken if beams end within the slot, free if they pass it."""
-        near = self._near(scan)
-        if not len(near):
-            return
+        near = self._slots_near(scan.x, scan.y, min(scan.max_range, 15.0))
         ended, passed = _beams_on_slots(
             scan.x, scan.y, np.cos(scan.angle), np.sin(scan.angle), scan.distance,
             self.lot.slot_xy[near], self.lot.slot_yaw[near], self._inner[near], CORE,
         )  # fmt: skip
         beams = ended + passed
         share = ended / np.maximum(beams, 1)
-        change = np.where(share > _CLEAR, SCAN_LOG_ODDS, np.where(share < 1.0 - _CLEAR, -SCAN_LOG_ODDS, 0.0))
+        free = np.where(share < 1.0 - _BEAM_MAJORITY, -SCAN_LOG_ODDS, 0.0)
+        change = np.where(share > _BEAM_MAJORITY, SCAN_LOG_ODDS, free)
         change[beams < _LEAST_BEAMS] = 0.0
-        self.log_odds[near] += change
-        self.in_view[near] |= change != 0.0
-        self.updated[near] |= change != 0.0
-        self._clip()
+        self._add(near, change)
 
     def update_from_picture(
         self, ground: GroundView, vehicle: FloatArray, boxes: FloatArray, errors: RangingErrors
@@ -180,7 +163,7 @@ class SlotFilter:
             errors: standard deviations of position and heading.
         """
         x, y, yaw = ground.mount.in_world(vehicle)
-        near = np.array(sorted(self._tree.query_ball_point([x, y], VIEW_REACH)), dtype=np.int64)
+        near = self._slots_near(x, y, VIEW_REACH_M)
         if not len(near):
             return
         # Corners of a usual car in each slot, ahead and to the right of the camera.
@@ -196,33 +179,27 @@ class SlotFilter:
         size = np.array([ground.camera.width, ground.camera.height])
         inside = (np.minimum(high, size) - np.maximum(low, 0.0)) / (high - low)
         others = np.concatenate(
-            [boxes, np.concatenate([low, high], axis=1)[self.log_odds[near] > -_KNOWN_FREE]]
+            [boxes, np.concatenate([low, high], axis=1)[self.log_odds[near] > -_FREE_LOG_ODDS]]
         )
         common = np.minimum(high[:, None], others[:, 2:]) - np.maximum(low[:, None], others[:, :2])
         covered = common.clip(0.0).prod(axis=2) / (high - low).prod(axis=1)[:, None]
         # A box with its lower edge above the ground at the slot's far end shows a car behind; a nearer slot's is lower.
         end = np.repeat(corners[:, :4, 1].min(axis=1)[:, None], len(others), axis=1)
         end[:, len(boxes) :] = high[:, 1, None] + 1.0
-        hidden = ((covered > _COVERED) & (others[:, 3] >= end)).any(axis=1)
+        hidden = ((covered > _OCCLUDED) & (others[:, 3] >= end)).any(axis=1)
         hidden |= np.array([self._is_walled((x, y), self.lot.slot_xy[slot]) for slot in near], dtype=np.bool_)
-        clear = (inside >= [1.0, _WHOLE]).all(axis=1) & ~hidden
+        clear = (inside >= [1.0, _SHOWN_HEIGHT]).all(axis=1) & ~hidden
         near, away = near[clear], np.hypot(*(self.lot.slot_xy[near[clear]] - [x, y]).T)
         shift = np.hypot(errors.position, errors.heading * away)
         sure = erf(self._size[near, 1] / np.maximum(math.sqrt(2.0) * shift, 1e-9))
-        change = -_logit(P_PRIOR + sure * (1.0 / (1.0 + errors.detector.missed) - P_PRIOR)) * (
-            sure > LEAST_SHARE
-        )
-        self.log_odds[near] += change
-        self.in_view[near] |= change != 0.0
-        self.updated[near] |= change != 0.0
-        self._clip()
+        evidence = _logit(P_PRIOR + sure * (1.0 / (1.0 + errors.detector.missed) - P_PRIOR))
+        self._add(near, -evidence * (sure > LEAST_ASSIGNMENT))
 
     @cached_property
     def _walls(self) -> STRtree:
         return STRtree([LineString(wall) for wall in self.lot.walls])
 
     def _is_walled(self, eye: tuple[float, float], point: FloatArray) -> bool:
-        """Return whether a wall crosses the line between two points."""
         line = LineString(np.array([eye, point]))
         return bool(len(self._walls.query(line, predicate="intersects")))
 
@@ -236,15 +213,16 @@ class SlotFilter:
         slots = np.flatnonzero(self.in_view & (self.log_odds != 0.0))
         return SlotObservation(slots, self.log_odds[slots] > 0.0)
 
-    def _clip(self) -> None:
-        np.clip(self.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS, out=self.log_odds)
+    def _add(self, slots: IntArray, log_odds: FloatArray) -> None:
+        """Add evidence, (k,), to different slots, (k,); 0 is none."""
+        self.log_odds[slots] = np.clip(self.log_odds[slots] + log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS)
+        changed = slots[log_odds != 0.0]
+        self.in_view[changed] = self.updated[changed] = True
 
-    def _near(self, scan: RangeScan) -> IntArray:
-        found = self._tree.query_ball_point([scan.x, scan.y], min(scan.max_range, 15.0))
-        return np.array(sorted(found), dtype=np.int64)
+    def _slots_near(self, x: float, y: float, reach: float) -> IntArray:
+        return np.array(sorted(self._tree.query_ball_point([x, y], reach)), dtype=np.int64)
 
     def _in_slot(self, xy: FloatArray, slot: IntArray) -> FloatArray:
-        """Transform points into the frames of slots: along and across."""
         yaw = self.lot.slot_yaw[slot]
         away = xy - self.lot.slot_xy[slot]
         along = np.cos(yaw) * away[:, 0] + np.sin(yaw) * away[:, 1]

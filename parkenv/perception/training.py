@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.errors import InputError, require_number, require_whole, with_extra
@@ -30,15 +29,11 @@ _NO_CARS = np.empty((0, 4))
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Parameters of the training."""
-
     penalty: float = 0.03  # C of the support vector machine
     rounds: int = 3  # rounds of hard-negative mining, each on another part of the images
     jitter: int = 4  # number of shifted and scaled copies of each positive
     misaligned: int = 2  # number of misaligned crops of each positive that become negatives
-    enlarged: float = (
-        2.0  # without photographs, crops enlarged so much take their place in the mining; 0: none do
-    )
+    enlarged: float = 2.0  # without photographs, false positives are mined in crops enlarged so much; 0: none
     seed: int = 0  # seed of the jitter and the solver
 
     def __post_init__(self) -> None:
@@ -113,7 +108,8 @@ def train(
     images += photos or _enlarged(positives, negatives, car, settings.enlarged)
     for round_number in range(settings.rounds + 1):
         progress(f"round {round_number}: {len(yes)} positives, {len(no)} negatives")
-        model = _fitted(model, yes, no, settings)
+        weights, bias = _svm(yes, no, settings)
+        model = replace(model, weights=weights.reshape(descriptor.shape), bias=bias)
         if round_number == settings.rounds:
             break
         hard = mined(model, images[round_number :: settings.rounds])
@@ -131,7 +127,6 @@ def _enlarged(
     car: tuple[float, float, float, float],
     by: float,
 ) -> list[LabelledImage]:
-    """Return images without cars and crops with one, enlarged."""
     if not by:
         return []
 
@@ -166,14 +161,8 @@ def mined(model: CarModel, images: Sequence[LabelledImage]) -> Float32Array:
         for car in labelled.boxes:
             seen = seen.select(overlaps(car, seen.boxes) <= CAR_OVERLAP)
         seen = seen.select(best_boxes(seen.regions, seen.score, 0.6)[:_PER_IMAGE])
-        cuts = [_cut(image, (r[0], r[1]), (r[2], r[3]), size) for r in seen.regions.tolist()]
-        found += [window.describe(cut)[None] for cut in cuts]
+        found += [window.describe(cut_out(image, region, size))[None] for region in seen.regions.tolist()]
     return np.concatenate(found)
-
-
-def _fitted(model: CarModel, yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> CarModel:
-    weights, bias = _svm(yes, no, settings)
-    return replace(model, weights=weights.reshape(model.descriptor.shape), bias=bias)
 
 
 def _svm(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tuple[Float32Array, float]:
@@ -195,7 +184,6 @@ def _svm(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tup
 
 
 def _calibration(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tuple[float, float]:
-    """Return slope and offset of the probability, from scores of held-out samples."""
     from sklearn.linear_model import LogisticRegression
 
     # Copies of a car are a fixed number of rows apart; blocks keep most of them together.
@@ -215,11 +203,9 @@ def _how(image: Image, size: tuple[int, int]) -> int:
     return int(cv2.INTER_AREA if image.shape[1] > size[0] and image.shape[0] > size[1] else cv2.INTER_LINEAR)
 
 
-def _cut(
-    image: Image, left_top: tuple[float, float], right_bottom: tuple[float, float], size: tuple[int, int]
-) -> Image:
-    """Cut out a part of an image, px, and resize it; the border is replicated outside."""
-    (left, top), (right, bottom) = left_top, right_bottom
+def cut_out(image: Image, region: Sequence[float], size: tuple[int, int]) -> Image:
+    """Cut a region, px, left, top, right, bottom, out of an image, resize it; the border is replicated outside."""
+    left, top, right, bottom = region
     scale_x, scale_y = (right - left) / size[0], (bottom - top) / size[1]
     moved = np.array([[scale_x, 0.0, left + 0.5 * scale_x - 0.5], [0.0, scale_y, top + 0.5 * scale_y - 0.5]])
     if scale_x > 1.0 and scale_y > 1.0:
@@ -232,21 +218,14 @@ def _cut(
     return np.asarray(cv2.warpAffine(image, moved, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
-def cut_out(image: Image, region: NDArray[np.float64], size: tuple[int, int]) -> Image:
-    """Cut a region, (4,) px, left, top, right, bottom, out of an image, and resize it to (width, height)."""
-    left, top, right, bottom = region.tolist()
-    return _cut(image, (left, top), (right, bottom), size)
-
-
 def _shifted(crop: Image, size: tuple[int, int], dx: float, dy: float, grow: float) -> Image:
     """Return a window that is shifted, and larger on each side, by fractions of the crop's sides."""
     height, width = crop.shape
-    left_top = (dx - grow) * width, (dy - grow) * height
-    return _cut(crop, left_top, ((1.0 + dx + grow) * width, (1.0 + dy + grow) * height), size)
+    ends = (dx - grow) * width, (dy - grow) * height, (1.0 + dx + grow) * width, (1.0 + dy + grow) * height
+    return cut_out(crop, ends, size)
 
 
 def _moved(crop: Image, size: tuple[int, int], rng: np.random.Generator) -> Image:
-    """Return a slightly shifted and scaled copy."""
     dx, dy = rng.uniform(-_SHIFT, _SHIFT, 2)
     return _shifted(crop, size, dx, dy, rng.uniform(-_RESIZE, _RESIZE) / 2.0)
 

@@ -86,7 +86,6 @@ def locate(n: int, places: Places, inverse_depth: Float32Array, view: View, batc
 
 @compiled(**VECTOR_LOOP)
 def fade_into_haze(n: int, light: Light, batch: Batch) -> None:
-    """Fade the first n radiances into the horizon's colour, the more the farther."""
     for i in range(n):
         # 1 - exp(-k) to three decimals, for the k of usual road scenes.
         k = light.haze * batch.distance[i]
@@ -98,7 +97,6 @@ def fade_into_haze(n: int, light: Light, batch: Batch) -> None:
 
 @compiled(**VECTOR_LOOP)
 def read(n: int, places: Places, image: Float32Array, batch: Batch) -> None:
-    """Read the first n radiances from an (h, w, 3) image."""
     for i in range(n):
         row, column = np.uint64(places.row[i]), np.uint64(places.column[i])
         batch.red[i] = image[row, column, 0]
@@ -108,7 +106,6 @@ def read(n: int, places: Places, image: Float32Array, batch: Batch) -> None:
 
 @compiled(**VECTOR_LOOP)
 def write(n: int, places: Places, batch: Batch, image: Float32Array) -> None:
-    """Write the first n radiances into an (h, w, 3) image."""
     for i in range(n):
         row, column = np.uint64(places.row[i]), np.uint64(places.column[i])
         image[row, column, 0] = batch.red[i]

@@ -23,37 +23,23 @@ _GROUND_TONE = 0.12  # albedo of the ground in reflections and for bounced light
 
 
 class Light(NamedTuple):
-    """The light of a weather for compiled code; colours are relative linear RGB radiance (see `Weather`).
+    """A weather's light for compiled code; colours are (3,) float32, relative linear RGB radiance (see `Weather`)."""
 
-    Attributes:
-        sun_direction: (3,) float32, unit vector to the sun, world frame.
-        sun, sky, horizon: (3,) float32, as in `Weather`.
-        haze, wetness, lit_windows: as in `Weather`.
-        background: (h, w, 3) float32, the sky behind every pixel.
-        mirrored, brightest: the blurred sky, for `look_up`.
-        ground: (3,) float32, radiance of open ground in reflections and as bounced light.
-    """
-
-    sun_direction: Float32Array
+    sun_direction: Float32Array  # (3,), world frame
     sun: Float32Array
     sky: Float32Array
     horizon: Float32Array
     haze: Single
     wetness: Single
     lit_windows: Single
-    background: Float32Array
-    mirrored: NDArray[np.uint32]
+    background: Float32Array  # (h, w, 3), the sky behind every pixel
+    mirrored: NDArray[np.uint32]  # and `brightest`: the blurred sky, for `look_up`
     brightest: Single
-    ground: Float32Array
+    ground: Float32Array  # open ground in reflections and as bounced light
 
 
 def daylight(weather: Weather, background: Float32Array) -> Light:
-    """Return the light of a weather.
-
-    Args:
-        weather: the weather.
-        background: (h, w, 3) float32, the sky of the view.
-    """
+    """Return the light of a weather; `background`, (h, w, 3) float32, is the sky of the view."""
     sun, sky = np.array(weather.sun), np.array(weather.sky)
     ground = _GROUND_TONE * (1.0 - 0.5 * weather.wetness) * (sun * weather.sun_direction[2] + sky)
     return Light(

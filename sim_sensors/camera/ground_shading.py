@@ -23,16 +23,11 @@ _GRAIN_PER_M = np.float32(1.0 / _GRAIN_M)
 def ground_levels(
     rays_down: NDArray[np.float64], height: float, focal: float, texel: float
 ) -> tuple[Float32Array, Single]:
-    """Return the pyramid level at which a ground texel is about as large as a pixel, for every row.
+    """Return the pyramid level, (h,) float32, at which a ground texel is as large as a pixel, for every row.
 
-    Args:
-        rays_down: (h,) world z of the ray at unit depth in the middle of each row.
-        height: m, camera height above the ground.
-        focal: px, focal length along the rows.
-        texel: m, side of a texel of the finest level.
-
-    Returns:
-        (h,) float32 levels of the ground, and the number to add for those of the asphalt's grain.
+    And the number to add for levels of the asphalt's grain. `rays_down`, (h,), is the world z of the ray at unit depth
+    in the middle of each row, `height` that of the camera, m, `focal` in px, and `texel` the side of a texel of the
+    finest level, m.
     """
     depth = -height / np.minimum(rays_down, -1e-3)
     # A pixel covers depth/f across and depth²/(f·h) along the ground: their geometric mean keeps edges sharp.

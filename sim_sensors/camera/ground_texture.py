@@ -23,25 +23,16 @@ _SUBPIXEL = 4  # bits of fraction in OpenCV's polygon corners
 
 
 class GroundTexture(NamedTuple):
-    """Albedo of the ground as an image pyramid.
+    """Albedo of the ground as an image pyramid, level after level, row-major, rows along y."""
 
-    Attributes:
-        texels: (total,) uint32, from the lowest byte on: square root of the grey albedo, fraction of grass, capacity
-            for water, each 255 = 1; level after level, row-major, rows along y.
-        start: (n_levels,) int32, first texel of each level.
-        shape: (n_levels, 2) int32, rows and columns of each level.
-        per_m: (n_levels, 2) float32, texels per metre along y and x.
-        x, y: m, corner of the image.
-        texel: m, side of a texel of the finest level.
-    """
-
+    # (total,) from the lowest byte on: square root of the grey albedo, fraction of grass, capacity for water, 255 = 1
     texels: NDArray[np.uint32]
-    start: NDArray[np.int32]
-    shape: NDArray[np.int32]
-    per_m: NDArray[np.float32]
-    x: float
+    start: NDArray[np.int32]  # (n_levels,) first texel of each level
+    shape: NDArray[np.int32]  # (n_levels, 2) rows and columns of each level
+    per_m: NDArray[np.float32]  # (n_levels, 2) texels per metre along y and x
+    x: float  # m, and y: corner of the image
     y: float
-    texel: float
+    texel: float  # m, side of a texel of the finest level
 
 
 _TEXTURES: WeakKeyDictionary[Ground, GroundTexture] = WeakKeyDictionary()
@@ -116,7 +107,6 @@ def _extent(ground: Ground) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _strip(x0: float, y0: float, x1: float, y1: float, width: float) -> NDArray[np.float64]:
-    """Return the four corners of a line with a width."""
     along = np.array([x1 - x0, y1 - y0])
     across = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9) * width / 2.0
     start, end = np.array([x0, y0]), np.array([x1, y1])
@@ -124,18 +114,15 @@ def _strip(x0: float, y0: float, x1: float, y1: float, width: float) -> NDArray[
 
 
 def _spread(noise: NDArray[np.float64], columns: int, texel: float, period: float) -> NDArray[np.float32]:
-    """Stretch tileable noise so that it repeats every `period` metres; rows repeat after the last."""
     size = max(8, round(period / texel))
     return _beside(cv2.resize(noise.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC), columns)
 
 
 def _beside(tile: NDArray[Any], columns: int) -> NDArray[np.float32]:
-    """Repeat a tile along its rows, up to a number of columns."""
     return np.tile(tile, columns // tile.shape[1] + 1)[:, :columns]
 
 
 def _repair(asphalt: NDArray[np.float32], generator: np.random.Generator, texel: float) -> None:
-    """Draw darker or lighter rectangles: repaired road surface."""
     rows, columns = asphalt.shape
     for _ in range(int(asphalt.size * texel**2 / 250.0)):
         height, width = (generator.uniform(0.5, 3.5, 2) / texel).astype(int)
@@ -167,7 +154,6 @@ def _stains(
 
 
 def _cracks(shape: tuple[int, ...], generator: np.random.Generator, texel: float) -> NDArray[np.uint8]:
-    """Return how dark cracks are, 255 = 1: random walks."""
     rows, columns = shape
     mask = np.zeros((rows, columns), dtype=np.uint8)
     for _ in range(int(rows * columns * texel**2 / 90.0)):
@@ -194,7 +180,6 @@ def _pyramid(image: NDArray[np.uint8], low: NDArray[np.float64], texel: float) -
 
 
 def _packed(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """Pack an (h, w, 3) image into (h, w): one load then fetches a whole texel."""
     wide = np.zeros((*image.shape[:2], 4), dtype=np.uint8)
     wide[..., :3] = image
     return wide.view("<u4")[..., 0].astype(np.uint32)
@@ -228,7 +213,6 @@ def sample_ground(texture: GroundTexture, x: Single, y: Single, level: int) -> t
 
 @compiled(**VECTOR_LEAF)
 def _mirrored(u: Single, n: Single) -> Single:
-    """Reflect `u` into [0, n - 1)."""
     span = n - 1.001
     u = abs(u)
     u -= 2.0 * span * np.floor(u / (2.0 * span))

@@ -113,8 +113,6 @@ class ImageSensor:
 
 
 class _Lens(NamedTuple):
-    """What the lens does to an image."""
-
     side: np.float32  # weight of each neighbour in a blur of three pixels
     dark_rows: Float32Array  # (h,) and (3 w,) float32: their sum is the light lost at a channel of a pixel
     dark_columns: Float32Array
@@ -145,7 +143,6 @@ def _tone_curve() -> NDArray[np.int32]:
 
 
 def _draw_rain(radiance: Float32Array, rain: float, generator: np.random.Generator) -> None:
-    """Draw faint, nearly vertical streaks that are brighter than their background."""
     height, width, _ = radiance.shape
     count = int(rain * 500 * height * width / (640 * 480))
     column = generator.uniform(0, width, count)

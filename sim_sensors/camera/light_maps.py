@@ -15,22 +15,15 @@ from sim_sensors.mesh import MeshPool
 
 
 class LightMaps(NamedTuple):
-    """Occlusion of sun and sky.
+    """Occlusion of sun and sky."""
 
-    Attributes:
-        shadow: (n, n) float32, m, height towards the sun of the nearest occluder; 0 if there is none.
-        to_shadow: (3, 4) float64, maps a world point (x, y, z, 1) to column, row (texels) and that height.
-        contact: (m, m) uint32, `quads` of the fraction of the sky that vehicles hide from the ground, 255 = all.
-        x, y: m, corner of the contact map.
-        texels_per_m: resolution of the contact map.
-    """
-
-    shadow: Float32Array
-    to_shadow: FloatArray
+    shadow: Float32Array  # (n, n) m, height towards the sun of the nearest occluder; 0 if there is none
+    to_shadow: FloatArray  # (3, 4) maps a world point (x, y, z, 1) to column, row (texels) and that height
+    # (m, m) `quads` of the fraction of the sky that vehicles hide from the ground, 255 = all
     contact: NDArray[np.uint32]
-    x: float
+    x: float  # m, and y: corner of the contact map
     y: float
-    texels_per_m: float
+    texels_per_m: float  # of the contact map
 
 
 _BOXES: WeakKeyDictionary[MeshPool, FloatArray] = WeakKeyDictionary()

@@ -70,8 +70,6 @@ class Frame:
 
 
 class _RenderedFrame(Frame):
-    """A frame whose ground truth is computed when it is first asked for."""
-
     def __init__(
         self,
         image: NDArray[np.uint8],
@@ -207,37 +205,31 @@ class PinholeCamera:
         Raises:
             SensorError: the pose is not finite, not a rotation, below the ground, or inside a vehicle.
         """
-        weather = Weather() if weather is None else weather
-        pose = checked_pose(scene, pose)
-        radiance, triangles, visibility = self._render_radiance(scene, pose, weather)
-        chosen = self.sensor.gain(radiance) if gain is None else gain
-        image = self.sensor.expose(radiance, seed, chosen, rain=weather.rain)
-        return _RenderedFrame(image, visibility, triangles.instance, scene.instances.ids)
+        return self._exposed(scene, pose, weather or Weather(), seed, gain)[0]
 
-    def _render_radiance(
-        self, scene: Drawable, pose: FloatArray, weather: Weather
-    ) -> tuple[Float32Array, ScreenTriangles, Visibility]:
-        """Return the radiance, and what is seen at the pixels' centres."""
-        seen = self.visibility(scene, pose)
+    def _exposed(
+        self, scene: Drawable, pose: FloatArray, weather: Weather, seed: int, gain: float | None
+    ) -> tuple[Frame, float]:
+        """Return an image, and the exposure."""
+        pose = checked_pose(scene, pose)
+        triangles, seen = self.visibility(scene, pose)
         texture, maps = _surroundings(scene, scene.instances, pose, weather)
         if self.supersampling == 1:
-            return shade(*seen, pose, self.intrinsics, weather, texture, maps), *seen
-        fine = PinholeCamera(
-            2 * self.width, 2 * self.height, 2 * self.fx, 2 * self.fy, 2 * self.cx, 2 * self.cy,
-            coarse_beyond=self.coarse_beyond / 2,
-        )  # fmt: skip
-        radiance = shade(*fine.visibility(scene, pose), pose, fine.intrinsics, weather, texture, maps)
-        return _halved(radiance), *seen
+            radiance = shade(triangles, seen, pose, self.intrinsics, weather, texture, maps)
+        else:
+            fine = PinholeCamera(
+                2 * self.width, 2 * self.height, 2 * self.fx, 2 * self.fy, 2 * self.cx, 2 * self.cy,
+                coarse_beyond=self.coarse_beyond / 2,
+            )  # fmt: skip
+            finer = fine.visibility(scene, pose)
+            radiance = _halved(shade(*finer, pose, fine.intrinsics, weather, texture, maps))
+        gain = self.sensor.gain(radiance) if gain is None else gain
+        image = self.sensor.expose(radiance, seed, gain, rain=weather.rain)
+        return _RenderedFrame(image, seen, triangles.instance, scene.instances.ids), gain
 
     def prepare(self, scene: Drawable, pose: FloatArray, weather: Weather | None = None) -> None:
-        """Draw and keep what pictures from nearby poses share: texture of the ground, shadows and sky.
-
-        Args:
-            scene: as in `render`.
-            pose: as in `render`.
-            weather: as in `render`.
-        """
-        weather = Weather() if weather is None else weather
+        """Draw and keep what pictures from nearby poses share: texture of the ground, shadows and sky."""
+        weather = weather or Weather()
         pose = checked_pose(scene, pose)
         # The shadows of what moves are drawn with each picture.
         still = scene.instances if scene.instances.still is None else scene.instances.still
@@ -260,10 +252,7 @@ class PinholeCamera:
 
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """A rectified image pair.
-
-    A point is in the same row of both images; its disparity, left minus right, is fx · baseline / depth.
-    """
+    """A rectified image pair: a point is in the same row, its disparity, left minus right, is fx · baseline / depth."""
 
     left: Frame  # frame of the left camera, with depth and ids
     right: Frame  # frame of the right camera
@@ -301,22 +290,15 @@ class StereoCamera:
 
         The images share textures, sky and shadows; their noise is independent.
         """
-        weather = Weather() if weather is None else weather
-        sensor = self.camera.sensor
-        frames = []
-        gain = None
-        for side, eye in enumerate((pose, self.right_pose(pose))):
-            radiance, triangles, seen = self.camera._render_radiance(scene, checked_pose(scene, eye), weather)
-            gain = sensor.gain(radiance) if gain is None else gain
-            image = sensor.expose(radiance, 2 * seed + side, gain, rain=weather.rain)
-            frames.append(_RenderedFrame(image, seen, triangles.instance, scene.instances.ids))
-        return StereoFrame(*frames)
+        weather = weather or Weather()
+        left, gain = self.camera._exposed(scene, pose, weather, 2 * seed, None)
+        right, _ = self.camera._exposed(scene, self.right_pose(pose), weather, 2 * seed + 1, gain)
+        return StereoFrame(left, right)
 
 
 def _surroundings(
     scene: Drawable, instances: Instances, pose: FloatArray, weather: Weather
 ) -> tuple[GroundTexture, LightMaps]:
-    """Return the texture of the ground, and the shadows of instances around a camera."""
     x, y = pose[:2, 3] + _AHEAD * pose[:2, 2]
     maps = light_maps(scene.pool, instances, weather, float(x), float(y))
     return ground_texture(scene.ground), maps
@@ -373,7 +355,6 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
 
 
 def _vehicle_around(scene: Drawable, point: FloatArray) -> int:
-    """Return the number of the vehicle in whose bounding box a point is, 0 for none."""
     instances, pool = scene.instances, scene.pool
     away = np.abs(instances.pose[:, :2] - point[:2]).max(axis=1)
     near = np.flatnonzero((away < pool.radius[instances.mesh]) & (instances.ids > 0))
@@ -417,7 +398,6 @@ def _geometry(
 
 @compiled(nogil=True)
 def _halved(image: Float32Array) -> Float32Array:
-    """Average every 2×2 pixels of an (h, w, 3) image."""
     height, width, _ = image.shape
     out = np.empty((height // 2, width // 2, 3), dtype=np.float32)
     for y in range(height // 2):

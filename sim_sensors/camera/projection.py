@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import FAST, LEAF
-from sim_sensors.mesh import Instances, Material, MeshPool
+from sim_sensors.mesh import Instances, Material, MeshArrays, MeshPool
 
 NEAR = 0.05  # m; nothing nearer is drawn
 _MOST_PARTS = 8
@@ -47,30 +47,13 @@ class ScreenTriangles(NamedTuple):
     instance: Int32Array  # (n,) int32, index into the instances, the nearest first
 
 
-class _Meshes(NamedTuple):
-    """The arrays of a `MeshPool`, as compiled code takes them, and which materials are closed."""
-
-    vertices: Float32Array
-    normals: Float32Array
-    triangles: Int32Array
-    material: NDArray[np.uint8]
-    color: NDArray[np.uint8]
-    vertex_start: NDArray[np.int64]
-    triangle_start: NDArray[np.int64]
-    closed: NDArray[np.bool_]
-
-
 class _Placed(NamedTuple):
-    """The visible instances: their numbers, meshes, and the poses of all instances."""
-
     visible: Int32Array
     mesh: Int32Array
     poses: FloatArray
 
 
 class _Camera(NamedTuple):
-    """Pose, (4, 4) camera to world, and intrinsics and image size, px."""
-
     pose: FloatArray
     fx: float
     fy: float
@@ -81,8 +64,6 @@ class _Camera(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Work arrays of a thread."""
-
     moved: FloatArray  # (n, 5) vertices in the camera frame, m, and in the image, px
     to_camera: FloatArray  # (3, 4) instance to camera
     cross: FloatArray  # (3, 3) cross products of a triangle's corners
@@ -100,13 +81,7 @@ def project(
 ) -> ScreenTriangles:
     """Cull, transform and clip the triangles of a scene; omit those that cover no pixel centre.
 
-    Args:
-        pool: the meshes.
-        instances: their poses.
-        pose: (4, 4) camera to world, camera frame x right, y down, z forward.
-        intrinsics: fx, fy, cx, cy, px.
-        size: width, height, px.
-        coarse_beyond: m; farther instances are drawn with the pool's coarse meshes, if it has any.
+    Instances farther than `coarse_beyond`, m, are drawn with the pool's coarse meshes, if it has any.
     """
     visible = _visible_instances(instances, pool.radius, pose, intrinsics, size)
     away = np.linalg.norm(instances.pose[visible, :3] - pose[:3, 3], axis=1)
@@ -136,18 +111,10 @@ def project(
     share = np.searchsorted(room, np.linspace(0, capacity, parts + 1)[1:-1])
     begin = np.concatenate([[0], share, [len(visible)]]).astype(np.int64)
     end = room[begin[:-1]]
-    meshes = _Meshes(
-        pool.vertices,
-        pool.normals,
-        pool.triangles,
-        pool.material,
-        pool.color,
-        pool.vertex_start,
-        pool.triangle_start,
-        _CLOSED,
-    )
     camera = _Camera(np.ascontiguousarray(pose, dtype=np.float64), *intrinsics, *size)
-    _project_parts(meshes, _Placed(visible, mesh, instances.pose), camera, begin, end, most_vertices, out)
+    _project_parts(
+        pool.arrays, _Placed(visible, mesh, instances.pose), camera, begin, end, most_vertices, out
+    )
     count = int(end[0])
     for first, last in zip(room[begin[1:-1]].tolist(), end[1:].tolist(), strict=True):
         for column in out:
@@ -163,7 +130,6 @@ def _visible_instances(
     intrinsics: tuple[float, float, float, float],
     size: tuple[int, int],
 ) -> Int32Array:
-    """Return the instances whose bounding sphere intersects the view frustum."""
     fx, fy, cx, cy = intrinsics
     center = (instances.pose[:, :3] - pose[:3, 3]) @ pose[:3, :3]
     reach = radius[instances.mesh].astype(np.float64)
@@ -177,7 +143,7 @@ def _visible_instances(
 
 @compiled(parallel=True, fastmath=FAST, nogil=True)
 def _project_parts(
-    meshes: _Meshes,
+    meshes: MeshArrays,
     placed: _Placed,
     camera: _Camera,
     begin: NDArray[np.int64],
@@ -202,7 +168,7 @@ def _project_parts(
 
 @compiled(fastmath=FAST, _nrt=False)
 def _project_instance(
-    meshes: _Meshes,
+    meshes: MeshArrays,
     placed: _Placed,
     camera: _Camera,
     index: int,
@@ -236,7 +202,7 @@ def _project_instance(
             cross[2, i] = a[j] * b[k] - a[k] * b[j]
         volume = a[0] * cross[0, 0] + a[1] * cross[0, 1] + a[2] * cross[0, 2]
         # Seen edge-on (or degenerate), or from behind.
-        if abs(volume) < 1e-12 or (volume > 0.0 and meshes.closed[meshes.material[t]]):
+        if abs(volume) < 1e-12 or (volume > 0.0 and _CLOSED[meshes.material[t]]):
             continue
         nearest = np.float32(1.0 / max(min(a[2], b[2], c[2]), NEAR))
         scale = 1.0 / volume
@@ -277,7 +243,7 @@ def _project_instance(
 
 @compiled(fastmath=FAST, _nrt=False)
 def _move_vertices(
-    meshes: _Meshes, mesh: int, pose: FloatArray, cosine: float, sine: float, camera: _Camera, work: _Work
+    meshes: MeshArrays, mesh: int, pose: FloatArray, cosine: float, sine: float, camera: _Camera, work: _Work
 ) -> None:
     """Set `work.moved` to the vertices of a mesh at a pose: in the camera frame, m, and in the image, px."""
     to_camera, moved = work.to_camera, work.moved

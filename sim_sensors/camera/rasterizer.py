@@ -31,6 +31,9 @@ _REFRESHED_AFTER = 128  # triangles drawn, until it is computed anew what they h
 _MARGIN = 1.0 + 1e-6  # between the inverse depth of a triangle's corners and that of its pixels, rounded
 
 
+_Edges = tuple[float, float, float, float, float, float, float]  # x, y of the upper two corners, and slopes
+
+
 class Visibility(NamedTuple):
     """The contents of the z-buffer, (h, w) each."""
 
@@ -51,11 +54,7 @@ def rasterize(
 ) -> Visibility:
     """Find the nearest opaque surface of every pixel, and the glass in front of it.
 
-    Args:
-        triangles: from `project`.
-        size: width, height, px.
-        floor: (3,) inverse depth of the ground, a·x + b·y + c at (x, y) px.
-        minimum: 1/m; ground with a smaller inverse depth is sky.
+    The inverse depth of the ground is a·x + b·y + c at (x, y) px, with `floor` = (a, b, c); below `minimum` it is sky.
     """
     width, height = size
     shape = (height, width)
@@ -129,7 +128,6 @@ def _sort_into_bands(
 
 @compiled(**LEAF)
 def edge_slope(x0: float, y0: float, x1: float, y1: float) -> float:
-    """Return the change of x per row along an edge; 0 for a horizontal edge, which no row crosses."""
     return (x1 - x0) / (y1 - y0) if y1 != y0 else 0.0
 
 
@@ -203,7 +201,6 @@ def _rasterize(
 
 @compiled(**LEAF)
 def _clear(y: int, floor: FloatArray, minimum: float, depth: Float32Array, triangle: Int32Array) -> None:
-    """Fill a row with the ground and the sky."""
     # In double precision: towards the horizon most of the digits cancel.
     base = floor[1] * (y + 0.5) + floor[2] + 0.5 * floor[0]
     for x in range(depth.shape[0]):
@@ -228,7 +225,6 @@ def _refresh(depth: Float32Array, first: int, end: int, hiding: Float32Array) ->
 
 @compiled(**LEAF)
 def _is_hidden(box: Int32Array, nearest: float, top: int, bottom: int, hiding: Float32Array) -> bool:
-    """Return whether a triangle is behind what is drawn in its columns of the strips that it is in."""
     limit = np.float32(nearest * _MARGIN)
     for strip in range((max(box[1], top) - top) // _STRIP, (min(box[3], bottom) - 1 - top) // _STRIP + 1):
         least = hiding[strip]
@@ -248,17 +244,10 @@ def _draw_opaque(
     depth: Float32Array,
     triangle: Int32Array,
 ) -> None:
-    """Draw a triangle into the rows `top` to `bottom`."""
-    ax, ay, bx, by, cx, cy = sorted_by_row(corners)
-    slope_ac = edge_slope(ax, ay, cx, cy)
-    slope_ab = edge_slope(ax, ay, bx, by)
-    slope_bc = edge_slope(bx, by, cx, cy)
-    for y in range(max(top, math.ceil(ay - 0.5)), min(bottom, math.ceil(cy - 0.5))):
-        py = y + 0.5
-        long = ax + (py - ay) * slope_ac
-        short = ax + (py - ay) * slope_ab if py < by else bx + (py - by) * slope_bc
-        x_first, x_end = _span(long, short, depth.shape[1])
-        base = plane[0] * (x_first + 0.5) + plane[1] * py + plane[2]
+    edges, first, end = _edges(corners, top, bottom)
+    for y in range(first, end):
+        x_first, x_end = _span(edges, y + 0.5, depth.shape[1])
+        base = plane[0] * (x_first + 0.5) + plane[1] * (y + 0.5) + plane[2]
         row_depth, row_triangle = depth[y], triangle[y]
         for x in range(x_first, x_end):
             value = np.float32(base + plane[0] * (x - x_first))
@@ -279,17 +268,10 @@ def _draw_pane(
     pane: Int32Array,
     n_panes: NDArray[np.uint8],
 ) -> None:
-    """Draw a triangle of glass into the rows `top` to `bottom`, in front of what is opaque."""
-    ax, ay, bx, by, cx, cy = sorted_by_row(corners)
-    slope_ac = edge_slope(ax, ay, cx, cy)
-    slope_ab = edge_slope(ax, ay, bx, by)
-    slope_bc = edge_slope(bx, by, cx, cy)
-    for y in range(max(top, math.ceil(ay - 0.5)), min(bottom, math.ceil(cy - 0.5))):
-        py = y + 0.5
-        long = ax + (py - ay) * slope_ac
-        short = ax + (py - ay) * slope_ab if py < by else bx + (py - by) * slope_bc
-        x_first, x_end = _span(long, short, depth.shape[1])
-        base = plane[0] * (x_first + 0.5) + plane[1] * py + plane[2]
+    edges, first, end = _edges(corners, top, bottom)
+    for y in range(first, end):
+        x_first, x_end = _span(edges, y + 0.5, depth.shape[1])
+        base = plane[0] * (x_first + 0.5) + plane[1] * (y + 0.5) + plane[2]
         for x in range(x_first, x_end):
             value = np.float32(base + plane[0] * (x - x_first))
             if value > depth[y, x]:
@@ -300,9 +282,21 @@ def _draw_pane(
 
 
 @compiled(**LEAF)
-def _span(one: float, other: float, width: int) -> tuple[int, int]:
-    """Return the first pixel centre between two edges in a row, and the one after the last."""
+def _edges(corners: Float32Array, top: int, bottom: int) -> tuple[_Edges, int, int]:
+    """Return the edges of a triangle, and the rows from `top` to `bottom` whose middles it meets, as a range."""
+    ax, ay, bx, by, cx, cy = sorted_by_row(corners)
+    slopes = edge_slope(ax, ay, cx, cy), edge_slope(ax, ay, bx, by), edge_slope(bx, by, cx, cy)
+    first, end = max(top, math.ceil(ay - 0.5)), min(bottom, math.ceil(cy - 0.5))
+    return (ax, ay, bx, by, slopes[0], slopes[1], slopes[2]), first, end
+
+
+@compiled(**LEAF)
+def _span(edges: _Edges, y: float, width: int) -> tuple[int, int]:
+    """Return the first pixel whose centre lies between the edges of a triangle in a row, and the one after the last."""
+    ax, ay, bx, by, slope_ac, slope_ab, slope_bc = edges
+    long = ax + (y - ay) * slope_ac
+    short = ax + (y - ay) * slope_ab if y < by else bx + (y - by) * slope_bc
     # Clamp before rounding: a clipped triangle can extend far beyond the image.
-    first = math.ceil(max(min(one, other), 0.0) - 0.5)
-    end = math.ceil(min(max(one, other), float(width)) - 0.5)
+    first = math.ceil(max(min(long, short), 0.0) - 0.5)
+    end = math.ceil(min(max(long, short), float(width)) - 0.5)
     return first, end

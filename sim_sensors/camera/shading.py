@@ -58,19 +58,9 @@ def shade(
     ground: GroundTexture,
     maps: LightMaps,
 ) -> Float32Array:
-    """Return the radiance of every pixel.
+    """Return the radiance of every pixel, (h, w, 3) float32, relative linear RGB (see `Weather`).
 
-    Args:
-        triangles: triangles on the screen.
-        visibility: the visible triangle of each pixel.
-        pose: (4, 4) camera to world.
-        intrinsics: fx, fy, cx, cy, px.
-        weather: the light.
-        ground: texture of the ground.
-        maps: shadow maps.
-
-    Returns:
-        (h, w, 3) float32, linear RGB, relative (see `Weather`).
+    `pose`, (4, 4), is that of the camera in the world, `intrinsics` are fx, fy, cx, cy, px.
     """
     height, width = visibility.triangle.shape
     fx, fy, cx, cy = intrinsics
@@ -212,7 +202,6 @@ def _split(
 
 @compiled(**VECTOR_LOOP)
 def _find_panes(pane: Int32Array, on_pane: Int32Array, panes: int) -> int:
-    """Append the columns of a row that show glass, and return the new length."""
     nearest = np.int32(-1)
     for x in range(pane.shape[0]):
         nearest = max(nearest, pane[x])
@@ -227,7 +216,6 @@ def _find_panes(pane: Int32Array, on_pane: Int32Array, panes: int) -> int:
 
 @compiled(**VECTOR_LOOP)
 def _note_row(y: int, begin: int, end: int, triangle: Int32Array, places: Places) -> None:
-    """Note the row and the triangles of the places that a row has added."""
     for i in range(begin, end):
         places.row[i] = y
         places.triangle[i] = triangle[np.uint64(places.column[i])]

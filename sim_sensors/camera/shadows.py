@@ -23,7 +23,7 @@ from parkenv.compiled.jit import compiled
 from sim_sensors.camera.light_maps import LightMaps, bounding_boxes
 from sim_sensors.camera.textures import quads
 from sim_sensors.camera.weather import Weather
-from sim_sensors.mesh import Instances, Material, MeshPool
+from sim_sensors.mesh import Instances, Material, MeshArrays, MeshPool
 
 _WINDOW = 72.0  # m, side of the square that the maps cover
 _STEP = 16.0  # m; the window moves in steps of this size, so a moving camera can reuse it
@@ -38,14 +38,10 @@ _FEW = 12  # more changed instances than these, and the map is drawn anew
 _MOST_PARTS = 8  # of a shadow map, for as many threads
 _GLASS = int(Material.GLASS)
 
-
-# First and end row, first and end column, texels.
-_Box = Sequence[int]
+_Box = Sequence[int]  # first and end row, first and end column, texels
 
 
 class _Window(NamedTuple):
-    """The maps of a window, and what they were drawn from."""
-
     rows: FloatArray  # (k, 6) float64: mesh, x, y, z, yaw, and whether it is a vehicle, of each instance
     footprints: Image  # the vehicles' footprints, before they are blurred
     maps: LightMaps
@@ -74,7 +70,6 @@ def light_maps(pool: MeshPool, instances: Instances, weather: Weather, x: float,
 
 
 def _near(pool: MeshPool, instances: Instances, x: float, y: float) -> NDArray[np.int64]:
-    """Return the instances that may cast a shadow into the window around (x, y)."""
     away = np.hypot(instances.pose[:, 0] - x, instances.pose[:, 1] - y)
     return np.flatnonzero(away < 0.75 * _WINDOW + pool.radius[instances.mesh])
 
@@ -87,7 +82,6 @@ def _rows(instances: Instances, chosen: NDArray[np.int64]) -> FloatArray:
 def _updated(
     before: _Window | None, pool: MeshPool, rows: FloatArray, weather: Weather, x: float, y: float
 ) -> _Window:
-    """Return the window with these instances, drawn anew or changed where they differ from those before."""
     if before is None:
         return _drawn(pool, rows, weather, x, y)
     if rows.shape == before.rows.shape and (rows == before.rows).all():
@@ -134,7 +128,6 @@ def _drawn(pool: MeshPool, rows: FloatArray, weather: Weather, x: float, y: floa
 
 
 def _with_moving(maps: LightMaps, pool: MeshPool, moving: FloatArray) -> LightMaps:
-    """Add the moving instances to the maps of the static ones."""
     shadow = maps.shadow
     if len(shadow) == _SHADOW_TEXELS:
         shadow = shadow.copy()
@@ -149,13 +142,11 @@ def _with_moving(maps: LightMaps, pool: MeshPool, moving: FloatArray) -> LightMa
 
 
 def _no_contact() -> tuple[NDArray[np.uint32], Image]:
-    """Return an empty contact map, and an empty image of footprints."""
     shape = (_CONTACT_TEXELS, _CONTACT_TEXELS)
     return np.zeros(shape, dtype=np.uint32), np.zeros(shape, dtype=np.uint8)
 
 
 def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
-    """Return the matrix from a world point (x, y, z, 1) to column, row of the shadow map and height towards the sun."""
     sun = np.array(weather.sun_direction)
     across = np.cross([0.0, 0.0, 1.0], sun)
     across /= np.linalg.norm(across)
@@ -172,13 +163,11 @@ def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
 
 
 def _within(box: _Box, n: int) -> _Box:
-    """Return the part of a box that lies in a map n wide."""
     top, bottom, left, right = box
     return max(top, 0), min(max(bottom, 0), n), max(left, 0), min(max(right, 0), n)
 
 
 def _shadow_boxes(pool: MeshPool, rows: FloatArray, to_shadow: FloatArray) -> NDArray[np.int64]:
-    """Return the box of each instance in the shadow map, (k, 4)."""
     low, high = np.split(bounding_boxes(pool)[_drawn_mesh(pool, rows)], 2, axis=1)
     corner = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(8, 3)
     local = np.where(corner, high[:, None], low[:, None])
@@ -203,7 +192,6 @@ def _cast(
     shadow: Float32Array,
     area: _Box = (0, _SHADOW_TEXELS, 0, _SHADOW_TEXELS),
 ) -> None:
-    """Raise the heights of a part of the shadow map to those of the instances."""
     boxes = _shadow_boxes(pool, rows, to_shadow)
     top, bottom, left, right = area
     meets = (boxes[:, 0] < bottom) & (boxes[:, 1] > top) & (boxes[:, 2] < right) & (boxes[:, 3] > left)
@@ -214,11 +202,7 @@ def _cast(
     most_vertices = int((pool.vertex_start[mesh + 1] - pool.vertex_start[mesh]).max())
     parts = min(get_num_threads(), _MOST_PARTS, bottom - top)
     _cast_parts(
-        pool.vertices,
-        pool.triangles,
-        pool.material,
-        pool.vertex_start,
-        pool.triangle_start,
+        pool.arrays,
         mesh,
         np.ascontiguousarray(rows[:, 1:5]),
         boxes,
@@ -233,11 +217,7 @@ def _cast(
 
 @compiled(parallel=True, nogil=True, error_model="numpy")
 def _cast_parts(
-    vertices: Float32Array,
-    triangles: Int32Array,
-    material: NDArray[np.uint8],
-    vertex_start: NDArray[np.int64],
-    triangle_start: NDArray[np.int64],
+    meshes: MeshArrays,
     mesh: Int32Array,
     poses: FloatArray,
     boxes: NDArray[np.int64],
@@ -255,10 +235,10 @@ def _cast_parts(
         for q in range(mesh.shape[0]):
             if boxes[q, 0] >= bottom or boxes[q, 1] <= top:
                 continue
-            first = vertex_start[mesh[q]]
+            first = meshes.vertex_start[mesh[q]]
             cosine, sine = math.cos(poses[q, 3]), math.sin(poses[q, 3])
-            for k in range(vertex_start[mesh[q] + 1] - first):
-                v = vertices[first + k]
+            for k in range(meshes.vertex_start[mesh[q] + 1] - first):
+                v = meshes.vertices[first + k]
                 x = poses[q, 0] + cosine * v[0] - sine * v[1]
                 y = poses[q, 1] + sine * v[0] + cosine * v[1]
                 z = poses[q, 2] + v[2]
@@ -266,9 +246,9 @@ def _cast_parts(
                     p[k, i] = (
                         to_shadow[i, 0] * x + to_shadow[i, 1] * y + to_shadow[i, 2] * z + to_shadow[i, 3]
                     )
-            for t in range(triangle_start[mesh[q]], triangle_start[mesh[q] + 1]):
-                if material[t] != _GLASS:
-                    a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            for t in range(meshes.triangle_start[mesh[q]], meshes.triangle_start[mesh[q] + 1]):
+                if meshes.material[t] != _GLASS:
+                    a, b, c = meshes.triangles[t, 0], meshes.triangles[t, 1], meshes.triangles[t, 2]
                     _cast_triangle(p[a], p[b], p[c], top, bottom, left, right, shadow)
 
 
@@ -283,7 +263,6 @@ def _cast_triangle(
     right: int,
     shadow: Float32Array,
 ) -> None:
-    """Raise the heights of texels whose centres lie in a triangle; corners are column, row and height."""
     area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
     if abs(area) < 1e-6:
         return
@@ -312,7 +291,6 @@ def _cast_triangle(
 
 
 def _footprint_boxes(pool: MeshPool, vehicles: FloatArray, maps: LightMaps) -> NDArray[np.int64]:
-    """Return the box around the footprint of each vehicle in the contact map, (k, 4)."""
     reach = pool.radius[vehicles[:, 0].astype(np.int64)] * _CONTACT_SCALE + 2.0
     column, row = (vehicles[:, 1] - maps.x) * _CONTACT_SCALE, (vehicles[:, 2] - maps.y) * _CONTACT_SCALE
     ends = np.column_stack([row - reach, row + reach, column - reach, column + reach])
@@ -326,7 +304,6 @@ def _print_footprints(
     footprints: Image,
     area: _Box = (0, _CONTACT_TEXELS, 0, _CONTACT_TEXELS),
 ) -> None:
-    """Add the footprints of vehicles to a part of an image of them."""
     boxes = _footprint_boxes(pool, vehicles, maps)
     corner = np.array([maps.x, maps.y])
     for vehicle, box in zip(vehicles, boxes.tolist(), strict=True):
@@ -347,7 +324,6 @@ def _print_footprints(
 
 
 def _blur_footprints(footprints: Image, contact: NDArray[np.uint32], box: _Box) -> None:
-    """Draw the contact map around a box: blurred twice, for the dark area between the wheels and for its border."""
     top, bottom, left, right = box
     reach = _BLUR_REACH
     top, bottom, left, right = _within(

@@ -30,33 +30,20 @@ _NOISE = 256
 
 
 class Sky(NamedTuple):
-    """A weather's sky for compiled code; colours are linear RGB radiance.
-
-    Attributes:
-        zenith, horizon, sun_direction: (3,) float64, as in `Weather`.
-        glow: strength of the brightness around the sun.
-        clouds: (256, 256) float32, tileable noise; there are clouds where it is above `threshold`.
-        threshold: see `clouds`.
-        white: (3,) float64, colour of a cloud.
-        top: (1024,) float64, z of the skyline by azimuth.
-        built: (1024,) bool, whether the skyline is a roof there rather than trees.
-        light: (3,) float64, light on the skyline.
-        veil: fraction of the skyline's colour that haze replaces.
-        speckle: (512, 512) float32, noise of leaves and walls.
-    """
+    """A weather's sky for compiled code; colours are linear RGB radiance, (3,) each."""
 
     zenith: FloatArray
     horizon: FloatArray
     sun_direction: FloatArray
-    glow: float
-    clouds: Float32Array
+    glow: float  # strength of the brightness around the sun
+    clouds: Float32Array  # (256, 256) tileable noise; there are clouds where it is above `threshold`
     threshold: float
-    white: FloatArray
-    top: FloatArray
-    built: NDArray[np.bool_]
-    light: FloatArray
-    veil: float
-    speckle: Float32Array
+    white: FloatArray  # a cloud
+    top: FloatArray  # (1024,) z of the skyline by azimuth
+    built: NDArray[np.bool_]  # (1024,) whether the skyline is a roof there rather than trees
+    light: FloatArray  # on the skyline
+    veil: float  # fraction of the skyline's colour that haze replaces
+    speckle: Float32Array  # (512, 512) noise of leaves and walls
 
 
 @lru_cache(maxsize=8)
@@ -105,7 +92,6 @@ def _falloff(size: int, slope: float) -> FloatArray:
 
 @compiled(**LEAF)
 def sky_radiance(sky: Sky, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return the radiance in the unit direction (x, y, z), z ≥ 0."""
     sun = sky.sun_direction
     near = min(max(x * sun[0] + y * sun[1] + z * sun[2], 0.0), 1.0)
     near *= near
@@ -157,13 +143,10 @@ def sky_radiance(sky: Sky, x: float, y: float, z: float) -> tuple[float, float, 
 
 @lru_cache(maxsize=8)
 def mirrored_sky(weather: Weather) -> Float32Array:
-    """Return the upper hemisphere as reflections show it, blurred.
+    """Return the upper hemisphere as reflections show it, blurred: (160, 160, 3) float32, linear RGB radiance.
 
-    It is a paraboloid map, which allows look-ups without trigonometry: direction (x, y, z) with z ≥ 0 lies at
-    ((x, y) / (1 + z) + 1) / 2 of the side.
-
-    Returns:
-        (160, 160, 3) float32, linear RGB radiance.
+    It is a paraboloid map, which allows look-ups without trigonometry: direction (x, y, z) with z ≥ 0 lies at ((x, y) /
+    (1 + z) + 1) / 2 of the side.
     """
     dome = np.empty((_DOME * _SAMPLES, _DOME * _SAMPLES, 3), dtype=np.float32)
     _fill_dome(sky_of(weather), dome)
@@ -172,11 +155,10 @@ def mirrored_sky(weather: Weather) -> Float32Array:
 
 @lru_cache(maxsize=8)
 def packed_sky(weather: Weather) -> tuple[NDArray[np.uint32], np.float32]:
-    """Return `mirrored_sky` for compiled code: one load fetches a texel.
+    """Return `mirrored_sky` for compiled code: one load fetches a texel, (160, 160) uint32.
 
-    Returns:
-        (160, 160) uint32, from the lowest bit on the square roots of blue (10 bits), green and red (11 bits each); and
-        the radiance of a colour's greatest code.
+    From the lowest bit on it has the square roots of blue (10 bits), green and red (11 bits each); their greatest codes
+    stand for the radiance that is returned besides.
     """
     dome = mirrored_sky(weather)
     brightest = max(float(dome.max()), 1e-6)
@@ -208,16 +190,9 @@ def sky_of_view(
     intrinsics: tuple[float, float, float, float],
     size: tuple[int, int],
 ) -> Float32Array:
-    """Return the sky behind every pixel of a view; the last views are kept.
+    """Return the sky behind every pixel of a view, (h, w, 3) float32, linear RGB radiance; the last views are kept.
 
-    Args:
-        weather: the weather.
-        rotation: (3, 3) float64, camera to world.
-        intrinsics: fx, fy, cx, cy, px.
-        size: width, height, px.
-
-    Returns:
-        (h, w, 3) float32, linear RGB radiance; the horizon's far below it. It must not be changed.
+    Far below the horizon it is the horizon's. `rotation`, (3, 3), is camera to world. The array must not be changed.
     """
     # Headings that differ by rounding alone share a sky.
     return _sky_of_view(weather, tuple(rotation.ravel().round(6).tolist()), intrinsics, size)
@@ -260,7 +235,6 @@ def _fill_view(
 def look_up(
     dome: NDArray[np.uint32], brightest: np.float32, x: np.float32, y: np.float32, z: np.float32
 ) -> tuple[Single, Single, Single]:
-    """Return the bilinear radiance in the unit direction (x, y, z), z ≥ 0, in a map of `packed_sky`."""
     n = dome.shape[0]
     scale = 0.5 / (1.0 + z)
     last: Single = np.float32(n - 1.001)
@@ -291,7 +265,6 @@ def _between(
     a: Single,
     b: Single,
 ) -> Single:
-    """Interpolate one colour between four texels; its greatest code `most` is 1."""
     c00, c01, c10, c11 = corners
     above = mix(_code(c00, shift, most), _code(c01, shift, most), a)
     below = mix(_code(c10, shift, most), _code(c11, shift, most), a)

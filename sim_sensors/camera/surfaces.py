@@ -30,26 +30,17 @@ _BOX_FACES = {
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh whose triangles have finishes instead of colours."""
-
     vertices: NDArray[np.float32]  # (v, 3) float32, m
     normals: NDArray[np.float32]  # (v, 3) float32, unit, outward
     triangles: NDArray[np.int32]  # (t, 3) int32, counter-clockwise seen from outside
     finish: NDArray[np.uint8]  # (t,) uint8, row of the palette
 
     def dyed(self, material: NDArray[np.uint8], color: NDArray[np.uint8]) -> Mesh:
-        """Return the mesh with materials and colours from a palette.
-
-        Args:
-            material: (n_finishes,) uint8.
-            color: (n_finishes, 3) uint8, sRGB.
-        """
+        """Return the mesh with materials and sRGB colours, (n_finishes,) and (n_finishes, 3) uint8, from a palette."""
         return Mesh(self.vertices, self.normals, self.triangles, material[self.finish], color[self.finish])
 
 
 class ShapeBuilder:
-    """Collects surfaces and welds them into a `Shape`."""
-
     def __init__(self) -> None:
         self._points: list[FloatArray] = []
         self._triangles: list[IntArray] = []
@@ -57,13 +48,10 @@ class ShapeBuilder:
         self._smooth: list[bool] = []
 
     def grid(self, points: ArrayLike, finish: ArrayLike, *, flip: bool = False, smooth: bool = True) -> None:
-        """Add a curved grid of quads.
+        """Add a curved grid of quads, (a, b, 3) m, with ∂/∂a × ∂/∂b to the outside, or, with `flip`, to the inside.
 
-        Args:
-            points: (a, b, 3) m. ∂/∂a × ∂/∂b points to the outside.
-            finish: () or (a - 1, b - 1) int.
-            flip: whether to swap inside and outside.
-            smooth: whether the sheet, and its seams with other smooth sheets, have common normals; else it is faceted.
+        There is one `finish`, or one of each quad. A smooth sheet has common normals, also at its seams with other
+        smooth sheets; another is faceted.
         """
         corner = np.asarray(points, dtype=np.float64)
         rows, columns = corner.shape[:2]
@@ -81,6 +69,11 @@ class ShapeBuilder:
         triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
         per_quad = np.broadcast_to(np.asarray(finish), (rows - 1, columns - 1)).reshape(-1)
         self._add(flat, triangles, np.repeat(per_quad, 2), smooth)
+
+    def both_sides(self, points: FloatArray, finish: ArrayLike, *, smooth: bool = True) -> None:
+        """Add a grid on the left, seen from the left, and its mirror image on the right."""
+        self.grid(points, finish, flip=True, smooth=smooth)
+        self.grid(points * [1.0, -1.0, 1.0], finish, smooth=smooth)
 
     def fan(self, points: ArrayLike, finish: int, *, flip: bool = False) -> None:
         """Add a flat convex polygon, (k, 3) m, counter-clockwise seen from outside."""
@@ -108,15 +101,9 @@ class ShapeBuilder:
         lean: float = 0.0,
         faces: str = "xXyYzZ",
     ) -> None:
-        """Add a box.
+        """Add a box of a size, m, along x, y, z; its top is scaled by `taper` along x and y, shifted by `lean` along x.
 
-        Args:
-            center: (3,) m.
-            size: (3,) m along x, y, z.
-            finish: finish of all faces.
-            taper: scale of the top along x and y.
-            lean: m, shift of the top along x.
-            faces: faces to keep, lower case for the low side of an axis.
+        `faces` are those to keep, lower case for the low side of an axis.
         """
         x, y, z = np.asarray(size, dtype=np.float64) / 2
         bottom = np.array([[-x, -y, -z], [x, -y, -z], [x, y, -z], [-x, y, -z]])
@@ -127,14 +114,10 @@ class ShapeBuilder:
     def turned(
         self, profile: ArrayLike, finish: ArrayLike, segments: int, *, smooth: bool = True, phase: float = 0.0
     ) -> None:
-        """Add a surface of revolution about the z axis.
+        """Add a surface of revolution about the z axis; `phase`, rad, is the angle of its first corner.
 
-        Args:
-            profile: (k, 2) radius and height, m; the outside lies to the right of its direction.
-            finish: () or (k - 1,) int, of each band.
-            segments: number of segments around the axis.
-            smooth: see `grid`.
-            phase: rad, angle of the first corner.
+        `profile`, (k, 2), has radius and height, m; the outside lies to the right of its direction. There is one
+        finish, or one of each band.
         """
         radius, height = np.asarray(profile, dtype=np.float64).T
         angle = phase + np.linspace(0.0, 2 * np.pi, segments + 1)
@@ -155,15 +138,10 @@ class ShapeBuilder:
         flip: bool = False,
         smooth: bool = True,
     ) -> None:
-        """Span a sheet between a curve on the left (y ≥ 0) and its mirror image on the right, facing up.
+        """Span a sheet between a curve on the left (y ≥ 0), (n, 3) m from rear to front, and its mirror image.
 
-        Args:
-            edge: (n, 3) m, from rear to front.
-            across: (k,) fractions of the half width, 1 on the left edge to -1 on the right.
-            crown: () or (n,) m, height of the middle above the edge.
-            finish: () or (n - 1, k - 1) int.
-            flip: whether the sheet faces down.
-            smooth: see `grid`.
+        `across` are (k,) fractions of the half width, from 1 on the left edge to -1 on the right; `crown`, () or (n,)
+        m, is the height of the middle above the edge. It faces up, or down with `flip`.
         """
         a = np.asarray(across, dtype=np.float64)
         points = np.repeat(edge[:, None], len(a), axis=1)
@@ -224,7 +202,6 @@ class ShapeBuilder:
 
 
 def _as_keys(rows: FloatArray) -> IntArray:
-    """Return one integer for each row of up to four small integers."""
     columns = rows.astype(np.int64) + 4096
     keys = columns[:, 0]
     for column in columns[:, 1:].T:
@@ -233,7 +210,6 @@ def _as_keys(rows: FloatArray) -> IntArray:
 
 
 def _point_numbers(points: FloatArray) -> IntArray:
-    """Return (n,) int64 numbers that are equal for points at the same position."""
     cell = np.round(points / WELD_M).astype(np.int64)
     keys = (cell[:, 0] * 73856093) ^ (cell[:, 1] * 19349663 << 8) ^ (cell[:, 2] * 83492791 << 16)
     return np.asarray(np.unique(keys, return_inverse=True)[1])
@@ -243,7 +219,6 @@ def _point_numbers(points: FloatArray) -> IntArray:
 def _corner_normals(
     corner: IntArray, face: FloatArray, area: FloatArray, smooth: NDArray[np.bool_]
 ) -> FloatArray:
-    """Return the unit normal at each corner of each triangle, (3 t, 3) float64."""
     spot = corner.ravel()
     order = np.argsort(spot, kind="mergesort")
     normal = np.empty((len(spot), 3))

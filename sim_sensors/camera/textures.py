@@ -25,8 +25,6 @@ VECTOR_LEAF = {**LEAF, "error_model": "numpy", "single": True}
 
 
 class Tile(NamedTuple):
-    """A square, tileable grey texture with its image pyramid."""
-
     # (total,) uint32, `quads` of the texels, 255 = 1; level after level, each row-major, half as wide as the previous
     levels: NDArray[np.uint32]
     start: NDArray[np.int32]  # (n_levels,) int32, start of each level
@@ -82,7 +80,6 @@ def _quad(here: Single, right: Single, below: Single, across: Single) -> Single:
 
 @lru_cache(maxsize=1)
 def grain_tile() -> Tile:
-    """Return the grain of asphalt: white noise over some fractal noise, the same in every scene."""
     generator = np.random.default_rng(41)
     image = 0.5 + 0.13 * fractal_noise(512, generator, 0.35) + 0.07 * fractal_noise(512, generator, 0.9)
     return make_tile(np.clip(image, 0.0, 1.0))
@@ -96,7 +93,6 @@ def cloud_noise() -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def cloud_tile() -> Tile:
-    """Return that noise as a tile."""
     return make_tile(cloud_noise())
 
 
@@ -124,19 +120,16 @@ def mix_quad(quad: Single, a: Single, b: Single) -> Single:
 
 @compiled(**VECTOR_LEAF)
 def byte(packed: Single, shift: int) -> Single:
-    """Return the eight bits from `shift` on."""
     return np.float32(np.int32((packed >> np.uint32(shift)) & np.uint32(255)))
 
 
 @compiled(**VECTOR_LEAF)
 def mix(a: Single, b: Single, fraction: Single) -> Single:
-    """Interpolate from a to b."""
     return a + (b - a) * fraction
 
 
 @compiled(**VECTOR_LEAF)
 def hash_unit(x: int, y: int) -> Single:
-    """Hash two integers to a number from 0 to 1."""
     h = (np.int64(x) * 374761393 + np.int64(y) * 668265263) & 0x7FFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0x7FFFFFFF
     return np.float32(h ^ (h >> 16)) * (1.0 / 2147483648.0)

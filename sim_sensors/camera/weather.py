@@ -14,8 +14,6 @@ Color = tuple[float, float, float]
 
 
 class _Drawn(NamedTuple):
-    """A random number between two bounds, or a colour times such a number."""
-
     low: float
     high: float
     color: Color | None = None

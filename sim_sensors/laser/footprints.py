@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, as_floats, as_integers
 
 NO_RETURN = -1
 WALL = -2
@@ -31,39 +31,24 @@ class Cells(NamedTuple):
     Places `0:cell_start[-1]` are sorted by cell, row after row, so neighbouring cells of a row are consecutive places.
     The places after them hold obstacles that are too large for a cell or have left their cell, and spare places. Unused
     places lie `FAR` away.
-
-    Attributes:
-        corners: (n_places / LANES · k · 2 · LANES,) float32, m, counter-clockwise, relative to the centre: for
-            each block of LANES places the x and the y of corner 0, of corner 1, ... A polygon with fewer than k corners
-            repeats its last one.
-        x, y: (n_places,) float64, m, world frame: the centre. Only offsets from it are float32, so a lot may lie
-            anywhere.
-        radius: (n_places,) float32, m, radius of a circle around the obstacle.
-        label: (n_places,) int32, the footprint's id, or `WALL`.
-        cell_start: (n_rows · n_columns + 1,) int64.
-        frame: (6,) float64: x and y of the first cell's corner and the cell size (m), rows, columns, number of places
-            in use.
-        k: number of corners per obstacle.
     """
 
+    # (n_places / LANES · k · 2 · LANES,) m, counter-clockwise, relative to the centre: for each block of LANES places
+    # the x and the y of corner 0, of corner 1, ... A polygon with fewer than k corners repeats its last one.
     corners: NDArray[np.float32]
-    x: FloatArray
+    x: FloatArray  # (n_places,) m, world frame: the centre. Only offsets are float32, so a lot may lie anywhere.
     y: FloatArray
-    radius: NDArray[np.float32]
-    label: NDArray[np.int32]
-    cell_start: IntArray
-    frame: FloatArray
-    k: int
+    radius: NDArray[np.float32]  # (n_places,) m, of a circle around the obstacle
+    label: NDArray[np.int32]  # (n_places,) the footprint's id, or `WALL`
+    cell_start: IntArray  # (n_rows · n_columns + 1,)
+    frame: FloatArray  # (6,) x and y of the first cell's corner and the cell size (m), rows, columns, places in use
+    k: int  # corners per obstacle
 
 
 class CellTable:
     """Convex polygons of at most k corners, sorted into cells; polygons can be replaced individually.
 
-    Args:
-        k: maximum number of corners.
-        corners: (n, k_max, 2) float64, m, world frame, counter-clockwise.
-        n_corners: (n,) int64; polygons with none or with more than k are omitted.
-        labels: (n,) int64.
+    Those with no corners or with more than k are omitted.
     """
 
     def __init__(self, k: int, corners: FloatArray, n_corners: IntArray, labels: IntArray) -> None:
@@ -94,34 +79,19 @@ class CellTable:
         self._write(np.arange(self._used), circle[order], corners[chosen], n_corners[chosen], labels[chosen])
 
     def copy(self) -> CellTable:
-        """Return an independent copy."""
         twin = object.__new__(CellTable)
         twin._used, twin._place = self._used, self._place.copy()
-        cells = self.cells
-        twin.cells = cells._replace(
-            corners=cells.corners.copy(),
-            x=cells.x.copy(),
-            y=cells.y.copy(),
-            radius=cells.radius.copy(),
-            label=cells.label.copy(),
-            frame=cells.frame.copy(),
-        )
+        changeable = ("corners", "x", "y", "radius", "label", "frame")
+        twin.cells = self.cells._replace(**{name: getattr(self.cells, name).copy() for name in changeable})
         return twin
 
     def remove(self, index: int) -> None:
-        """Remove a polygon, if there is one."""
         place = self._place[index]
         if place != NOWHERE:
             self.cells.x[place] = self.cells.y[place] = FAR
 
     def put(self, index: int, corners: FloatArray, label: int) -> bool:
-        """Replace polygon `index`; return False, without a change, if no place is free and a new sort is due.
-
-        Args:
-            index: index of the polygon.
-            corners: (3 to k, 2) float64, m, world frame, counter-clockwise.
-            label: its label.
-        """
+        """Replace polygon `index`; return False, without a change, if no place is free and a new sort is due."""
         count = np.array([len(corners)])
         circle = _enclosing_circles(corners[None], count)
         place, start = int(self._place[index]), self.cells.cell_start
@@ -187,13 +157,11 @@ class ScanPlane:
         walls: ArrayLike | None = None,
         ids: ArrayLike | None = None,
     ) -> None:
-        corners = _as_floats("footprints", footprints, (None, None, 2))
+        corners = as_floats("footprints", footprints, None, None, 2)
         n, k_max = corners.shape[:2]
-        count = np.full(n, k_max) if n_corners is None else _as_ints("n_corners", n_corners, n)
-        wall = _as_floats("walls", np.empty((0, 2, 2)) if walls is None else walls, (None, 2, 2))
-        self.ids = np.arange(n) if ids is None else _as_ints("ids", ids, n)
-        if n and self.ids.min() < 0:
-            raise SensorError(f"ids is {self.ids.min()}, want 0 or more")
+        count = np.full(n, k_max) if n_corners is None else as_integers("n_corners", n_corners, n)
+        wall = as_floats("walls", () if walls is None else walls, None, 2, 2)
+        self.ids = np.arange(n) if ids is None else as_integers("ids", ids, n, least=0)
         length = np.hypot(*(wall[:, 1] - wall[:, 0]).T)
         if (length < SHORTEST_EDGE_M).any():
             i = int(np.argmax(length < SHORTEST_EDGE_M))
@@ -230,7 +198,7 @@ class ScanPlane:
         """
         if not 0 <= index < self.n_footprints:
             raise SensorError(f"index is {index}, want 0 to {self.n_footprints - 1}")
-        new = _as_floats("corners", np.empty((0, 2)) if corners is None else corners, (None, 2))
+        new = as_floats("corners", () if corners is None else corners, None, 2)
         if len(new) > self.k_max:
             raise SensorError(f"corners has {len(new)} rows, want at most {self.k_max}")
         shape, count = _normalised("corners", new[None], np.array([len(new)]))
@@ -264,7 +232,6 @@ class ScanPlane:
 
 
 def _short_pieces(walls: FloatArray) -> FloatArray:
-    """Return the walls cut into pieces that fit into a cell, (n, 2, 2) float64."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     n = np.ceil(np.hypot(along[:, 0], along[:, 1]) / (2 * LARGEST_IN_A_CELL_M)).astype(np.int64)
     wall = np.repeat(np.arange(len(walls)), n)
@@ -274,7 +241,6 @@ def _short_pieces(walls: FloatArray) -> FloatArray:
 
 
 def _frame(circle: FloatArray) -> FloatArray:
-    """Return the frame of cells over all centres; see `Cells.frame`."""
     low, high = (circle[:, :2].min(0), circle[:, :2].max(0)) if len(circle) else (np.zeros(2), np.zeros(2))
     extent = high - low
     # If few obstacles cover a large area, larger cells keep the number of cells in proportion to them.
@@ -284,37 +250,10 @@ def _frame(circle: FloatArray) -> FloatArray:
 
 
 def _cell_of(circle: FloatArray, frame: FloatArray) -> IntArray:
-    """Return the cell of each centre, (n,) int64; -1 outside all cells."""
     x, y, size, rows, columns = frame[:5]
     column, row = np.floor((circle[:, 0] - x) / size), np.floor((circle[:, 1] - y) / size)
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     return np.where(inside, row * columns + column, -1).astype(np.int64)
-
-
-def _as_floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
-    """Return `value` as a finite float64 array of the given shape; None stands for any length."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise SensorError(f"{name} is {value!r}, want numbers") from error
-    if array.size == 0 and array.ndim < len(shape):
-        array = array.reshape([length or 0 for length in shape])
-    if array.ndim != len(shape) or any(
-        w is not None and w != g for w, g in zip(shape, array.shape, strict=True)
-    ):
-        wanted = ", ".join("any" if length is None else str(length) for length in shape)
-        raise SensorError(f"{name} has shape {array.shape}, want ({wanted})")
-    if not np.isfinite(array).all():
-        row = np.argwhere(~np.isfinite(array))[0]
-        raise SensorError(f"{name}{row.tolist()} is {array[tuple(row)]}, want a finite number")
-    return array
-
-
-def _as_ints(name: str, value: ArrayLike, n: int) -> IntArray:
-    array = np.asarray(value)
-    if array.shape != (n,) or (n and not np.issubdtype(array.dtype, np.integer)):
-        raise SensorError(f"{name} has shape {array.shape} of {array.dtype}, want ({n},) integers")
-    return array.astype(np.int64)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -322,7 +261,6 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _enclosing_circles(corners: FloatArray, n_corners: IntArray) -> FloatArray:
-    """Return x, y and radius of a circle around each polygon, (n, 3) float64."""
     used = np.arange(corners.shape[1]) < n_corners[:, None]
     centre = (corners * used[..., None]).sum(1) / n_corners[:, None]
     reach = np.hypot(*np.moveaxis(corners - centre[:, None], -1, 0))
@@ -330,16 +268,7 @@ def _enclosing_circles(corners: FloatArray, n_corners: IntArray) -> FloatArray:
 
 
 def _normalised(name: str, corners: FloatArray, n_corners: IntArray) -> tuple[FloatArray, IntArray]:
-    """Return the footprints counter-clockwise, without collinear corners.
-
-    Args:
-        name: name for error messages.
-        corners: (n, k_max, 2) float64, m.
-        n_corners: (n,) int64.
-
-    Returns:
-        (n, k_max, 2) float64 and (n,) int64.
-    """
+    """Return footprints, (n, k_max, 2), counter-clockwise, without collinear corners, and their numbers of corners."""
     k_max = corners.shape[1]
     wrong = (n_corners < 3) & (n_corners != 0) | (n_corners > k_max)
     if wrong.any():

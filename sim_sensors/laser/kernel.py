@@ -31,24 +31,15 @@ _FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
 class BeamTable(NamedTuple):
-    """Beams in a frame along their middle direction, padded to whole blocks.
+    """Beams in a frame along their middle direction, padded to whole blocks."""
 
-    Attributes:
-        u, v: (n_padded,) float32, direction of each beam.
-        number: (n_padded,) float32, 0, 1, 2, ...
-        n: number of beams.
-        middle: number of the beam along the frame's x axis; a half lies between two beams.
-        per_radian: beams per radian.
-        max_range: m.
-    """
-
-    u: Float32Array
+    u: Float32Array  # (n_padded,) direction of each beam, with v
     v: Float32Array
-    number: Float32Array
-    n: int
-    middle: float
-    per_radian: float
-    max_range: float
+    number: Float32Array  # (n_padded,) 0, 1, 2, ...
+    n: int  # number of beams
+    middle: float  # number of the beam along the frame's x axis; a half lies between two beams
+    per_radian: float  # beams per radian
+    max_range: float  # m
 
 
 @compiled(inline="always")
@@ -195,19 +186,18 @@ def _draw_lines(lines, n, low, high, begin, end, label, u, v, number, inverse, i
 
 
 @compiled(error_model="numpy", fastmath=_FAST)
-def _draw_table(  # type: ignore[no-untyped-def]
-    corners, xs, ys, radius, label, cell_start, frame, k,
-    poses, first_pose, last_pose, heading, excluded, u, v, number, n_beams, per_radian, middle, max_range,
-    shapes, lines, inverse, ids, here, covered,
-):  # fmt: skip
+def _draw_table(cells, poses, first_pose, last_pose, heading, excluded, beams, work):  # type: ignore[no-untyped-def]
     """Draw the obstacles of a cell table that are within range of several poses.
 
     Scan s has row s of `inverse` and, if it is not empty, of `ids`, (chunk · n_padded,). `covered[s]` is set to the
-    label of a footprint that contains the sensor. One call processes all poses of a chunk, because reference counting
-    of its array arguments costs as much as drawing a dozen obstacles.
+    label of a footprint that contains the sensor. One call processes all poses of a chunk: counting references costs.
     """
     f = np.float32
-    last_beam, half_turn, n_padded = f(n_beams - 1), f(math.pi) * per_radian, len(u)
+    corners, xs, ys, radius, label, cell_start, frame, k = cells
+    shapes, lines, inverse, ids, here, covered = work
+    u, v, number, max_range = beams.u, beams.v, beams.number, f(beams.max_range)
+    per_radian, middle = f(beams.per_radian), f(beams.middle)
+    last_beam, half_turn, n_padded = f(beams.n - 1), f(math.pi) * per_radian, len(u)
     left, bottom, size, rows, columns = frame[0], frame[1], frame[2], int(frame[3]), int(frame[4])
     reach = max_range + LARGEST_IN_A_CELL_M
     for pose in range(first_pose, last_pose):
@@ -288,7 +278,6 @@ def _draw_table(  # type: ignore[no-untyped-def]
 
 @compiled(error_model="numpy", fastmath=_FAST)
 def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: ignore[no-untyped-def]
-    """Add noise and dropouts to one scan, both read from `table` at random offsets."""
     f, n = np.float32, ranges.shape[1]
     for draw in range(offsets.shape[1]):
         noise, drop = np.uint64(offsets[scan, draw, 0]), np.uint64(offsets[scan, draw, 1])
@@ -304,23 +293,20 @@ def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: igno
 def scan_all(quads, others, poses, heading, exclude, beams, table, offsets, sd, lost, ranges, ids):  # type: ignore[no-untyped-def]
     """Fill `ranges`, (b, n_beams) float32, and `ids`, of the same shape, or (0, n_beams) to omit them."""
     f, n, n_padded, with_ids = np.float32, beams.n, len(beams.u), len(ids) > 0
-    max_range, per_radian, middle = f(beams.max_range), f(beams.per_radian), f(beams.middle)
-    u, v, number = beams.u, beams.v, beams.number
+    max_range = f(beams.max_range)
     least = f(1) / max_range
     shapes, here = np.empty(7 * LANES, np.float32), np.empty(n_padded, np.float32)
     lines = np.empty(2 * max(quads[-1], others[-1]), np.float32)
     chunk = min(POSES_PER_CHUNK, len(poses))
     inverse, covered = np.empty(chunk * n_padded, np.float32), np.empty(chunk, np.int32)
     seen = np.empty(chunk * n_padded if with_ids else 0, np.int32)
+    work = (shapes, lines, inverse, seen, here, covered)
     for first in range(0, len(poses), POSES_PER_CHUNK):
         last = min(first + POSES_PER_CHUNK, len(poses))
         inverse[:], covered[:], seen[:] = least, NO_RETURN, NO_RETURN
         for cells in (quads, others):
             if len(cells[1]) > 0:
-                _draw_table(
-                    *cells, poses, first, last, heading, exclude, u, v, number, n, per_radian, middle, max_range,
-                    shapes, lines, inverse, seen, here, covered,
-                )  # fmt: skip
+                _draw_table(cells, poses, first, last, heading, exclude, beams, work)
         for scan in range(first, last):
             row = np.uint64((scan - first) * n_padded)
             inside = covered[scan - first] != NO_RETURN

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
 from parkenv.compiled.arrays import Float32Array
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, as_floats
 from sim_sensors.laser.footprints import NO_RETURN, ScanPlane
 from sim_sensors.laser.kernel import BEAMS_PER_BLOCK, BEAMS_PER_DRAW, BeamTable, scan_all
 
@@ -101,65 +101,30 @@ class LaserScanner:
     def scan(
         self,
         plane: ScanPlane,
-        pose: ArrayLike,
-        rng: np.random.Generator | None = None,
-        *,
-        exclude: int | None = None,
-    ) -> Float32Array:
-        """Simulate one scan.
-
-        Args:
-            plane: the obstacles.
-            pose: (3,) x, y in m and yaw in rad of the sensor, world frame.
-            rng: generator for noise and dropouts; None for exact ranges.
-            exclude: id of footprints to ignore, such as the vehicle that carries the sensor.
-
-        Returns:
-            (n_beams,) float32, m, `inf` for no return.
-
-        Raises:
-            SensorError: the pose is not three finite numbers.
-        """
-        ranges, _ = self._measure(plane, _poses(pose, "pose", 1), rng, exclude, False)
-        return np.asarray(ranges[0])
-
-    def scan_with_ids(
-        self,
-        plane: ScanPlane,
-        pose: ArrayLike,
-        rng: np.random.Generator | None = None,
-        *,
-        exclude: int | None = None,
-    ) -> tuple[Float32Array, Int32Array]:
-        """Simulate one scan; also return (n_beams,) int32: the id hit, `WALL` (-2), or `NO_RETURN` (-1)."""
-        ranges, ids = self._measure(plane, _poses(pose, "pose", 1), rng, exclude, True)
-        return ranges[0], ids[0]
-
-    def scan_batch(
-        self,
-        plane: ScanPlane,
         poses: ArrayLike,
         rng: np.random.Generator | None = None,
         *,
         exclude: ArrayLike | None = None,
     ) -> Float32Array:
-        """Simulate many scans of one plane.
+        """Simulate scans of one plane.
 
         Args:
             plane: the obstacles.
-            poses: (b, 3) x, y in m and yaw in rad of the sensor, world frame.
+            poses: (3,) or (b, 3) x, y in m and yaw in rad of the sensor, world frame.
             rng: generator for noise and dropouts; None for exact ranges.
-            exclude: one id for all poses, or (b,) int, one per pose; -1 for none.
+            exclude: id of footprints to ignore, such as the vehicle that carries the sensor, or (b,) one per pose, -1
+                for none.
 
         Returns:
-            (b, n_beams) float32, m, `inf` for no return.
+            (n_beams,) or (b, n_beams) float32, m, `inf` for no return.
 
         Raises:
             SensorError: poses or ids have another shape, or a pose is not finite.
         """
-        return self._measure(plane, _poses(poses, "poses", 2), rng, exclude, False)[0]
+        ranges = self._measure(plane, poses, rng, exclude, False)[0]
+        return ranges if np.ndim(poses) == 2 else np.asarray(ranges[0])
 
-    def scan_batch_with_ids(
+    def scan_with_ids(
         self,
         plane: ScanPlane,
         poses: ArrayLike,
@@ -167,18 +132,20 @@ class LaserScanner:
         *,
         exclude: ArrayLike | None = None,
     ) -> tuple[Float32Array, Int32Array]:
-        """Simulate scans as `scan_batch` does; also return (b, n_beams) int32 ids as in `scan_with_ids`."""
-        return self._measure(plane, _poses(poses, "poses", 2), rng, exclude, True)
+        """Simulate scans; also return the id that each beam hits, int32, `WALL` (-2), or `NO_RETURN` (-1)."""
+        ranges, ids = self._measure(plane, poses, rng, exclude, True)
+        return (ranges, ids) if np.ndim(poses) == 2 else (ranges[0], ids[0])
 
     def _measure(
         self,
         plane: ScanPlane,
-        poses: NDArray[np.float64],
+        poses: ArrayLike,
         rng: np.random.Generator | None,
         exclude: ArrayLike | None,
         with_ids: bool,
     ) -> tuple[Float32Array, Int32Array]:
-        b = len(poses)
+        pose = as_floats("poses", poses, *((None, 3) if np.ndim(poses) == 2 else (3,))).reshape(-1, 3)
+        b = len(pose)
         excluded = np.full(b, NO_RETURN, np.int32)
         if exclude is not None:
             given = np.asarray(exclude)
@@ -195,7 +162,7 @@ class LaserScanner:
         scan_all(
             tuple(plane.cells[0]),
             tuple(plane.cells[1]),
-            poses,
+            pose,
             self.beams[1],
             excluded,
             self._beams,
@@ -207,20 +174,6 @@ class LaserScanner:
             ids,
         )
         return ranges, ids
-
-
-def _poses(value: ArrayLike, name: str, ndim: int) -> NDArray[np.float64]:
-    try:
-        poses = np.ascontiguousarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise SensorError(f"{name} is {value!r}, want numbers") from error
-    if poses.ndim != ndim or poses.shape[-1] != 3:
-        raise SensorError(f"{name} has shape {poses.shape}, want {'(3,)' if ndim == 1 else '(b, 3)'}")
-    poses = poses.reshape(-1, 3)
-    if not np.isfinite(poses).all():
-        i = int(np.argmin(np.isfinite(poses).all(1)))
-        raise SensorError(f"{name} is {poses[i].tolist()}, want finite x, y and yaw")
-    return poses
 
 
 @lru_cache(maxsize=1)

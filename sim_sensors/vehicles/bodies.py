@@ -19,42 +19,15 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.camera.surfaces import ShapeBuilder
 from sim_sensors.vehicles.forms import Form
 
-
-class Finish(IntEnum):
-    """Surface types of a vehicle's triangles."""
-
-    BODY = 0
-    BODY_DUSTY = 1
-    BODY_DIRTY = 2
-    SEAM = 3
-    GLASS = 4
-    TRIM = 5
-    BUMPER = 6  # painted; plastic on basic versions
-    CLADDING = 7  # along sills and arches: painted; plastic on rugged versions
-    GRILLE = 8
-    BRIGHT = 9  # chrome, or black
-    HEADLAMP = 10
-    REFLECTOR = 11
-    INDICATOR = 12
-    TAIL_LAMP = 13
-    TAIL_LAMP_DARK = 14
-    REVERSING_LAMP = 15
-    PLATE = 16
-    PLATE_INK = 17
-    PLATE_BAND = 18
-    TYRE = 19
-    RIM = 20
-    RIM_DARK = 21
-    SEAT = 22
-    CABIN = 23
-    HEADLINER = 24
-    UNDERSIDE = 25
-    MIRROR = 26
-    HANDLE = 27
-    RAIL = 28
-    PILLAR = 29
-
-
+Finish = IntEnum(
+    "Finish",
+    "BODY BODY_DUSTY BODY_DIRTY SEAM GLASS TRIM BUMPER CLADDING GRILLE BRIGHT HEADLAMP REFLECTOR INDICATOR TAIL_LAMP "
+    "TAIL_LAMP_DARK REVERSING_LAMP PLATE PLATE_INK PLATE_BAND TYRE RIM RIM_DARK SEAT CABIN HEADLINER UNDERSIDE MIRROR "
+    "HANDLE RAIL PILLAR",
+    start=0,
+)
+"""Surface types of a vehicle's triangles. Bumpers are painted, or plastic on basic versions; so is the cladding along
+sills and arches on rugged ones. Bright is chrome, or black."""
 N_FINISHES = len(Finish)
 
 # Sections: height between sill (0) and shoulder (1), and the distance (m) of the surface inside the plan.
@@ -79,15 +52,10 @@ _CUT = 0.012  # m over which an arch's edge drops to the sill
 class Skin:
     """The surfaces of a vehicle's shell as points: the left half, from the middle of the tail to that of the nose.
 
-    Args:
-        form: the lines of the body.
-        coarse: whether to use few columns and rows, without seams.
-
-    Attributes:
-        rows: (r,) heights between sill and shoulder.
-        flank: (c, r, 3) m, clamped to the wheel arches.
-        plan_angle: (c,) degrees from the axis: positive around the nose, negative around the tail, ±90 along the side.
-        seams: x of the middle of each door seam, front first.
+    `rows`, (r,), are heights between sill and shoulder, `flank` is (c, r, 3) m, clamped to the wheel arches,
+    `plan_angle`, (c,) in degrees from the axis: positive around the nose, negative around the tail, ±90 along the side,
+    and `seams` are x of the middle of each door seam, front first. A coarse skin has few columns and rows, and no
+    seams.
     """
 
     def __init__(self, form: Form, *, coarse: bool = False) -> None:
@@ -99,7 +67,6 @@ class Skin:
         self.flank, self.plan_angle = self._loft()
 
     def _columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return x, y on the plan and the plan angle of every column."""
         form = self.form
         half = form.length / 2
         tail, nose = -half + form.tail_depth, half - form.nose_depth
@@ -223,7 +190,6 @@ class Skin:
 
 
 def _shoulder_line(form: Form) -> PchipInterpolator:
-    """Return z of the shoulder over x."""
     half = form.length / 2
     middle = 0.5 * (form.cowl + form.glass_end)
     knots = [
@@ -239,7 +205,6 @@ def _shoulder_line(form: Form) -> PchipInterpolator:
 
 
 def _seams(form: Form) -> list[float]:
-    """Return x of the door seams of a side, front first."""
     front = min(form.front_axle - form.arch_radius - 0.09, form.cowl + 0.22)
     seams = [front, form.pillar]
     if form.doors == 2:
@@ -249,19 +214,10 @@ def _seams(form: Form) -> list[float]:
 
 def add_flanks(build: ShapeBuilder, skin: Skin) -> None:
     """Add the sheets from sill to shoulder on both sides, with lamps, grille, seams and dirt."""
-    points = skin.flank
-    finish = flank_finish(skin)
-    _both_sides(build, points, finish)
-
-
-def _both_sides(build: ShapeBuilder, points: FloatArray, finish: IntArray) -> None:
-    """Add a sheet on the left, whose first axis points forward and second up, and its mirror image."""
-    build.grid(points, finish, flip=True)
-    build.grid(points * [1.0, -1.0, 1.0], finish)
+    build.both_sides(skin.flank, flank_finish(skin))
 
 
 def flank_finish(skin: Skin) -> IntArray:
-    """Return the `Finish` of each cell of the left flank, (c - 1, r - 1) int64."""
     form = skin.form
     middle = 0.5 * (skin.rows[1:] + skin.rows[:-1])
     row = np.broadcast_to(middle, (len(skin.flank) - 1, len(middle)))

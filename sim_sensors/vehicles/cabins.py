@@ -30,15 +30,12 @@ _LAST_PILLAR = {
 
 
 class Post(NamedTuple):
-    """A column at the side of the glasshouse: x at foot and top, m, and the finish of the cell in front of it."""
-
     foot: float
     top: float
     ahead: Finish
 
 
 def _posts(form: Form) -> list[Post]:
-    """Return the columns of a side between the rear and the front corner, from the rear."""
     foot, top = _LAST_PILLAR[form.body]
     pillar = form.pillar
     panes = form.side_windows
@@ -148,9 +145,7 @@ class Glasshouse:
         return out
 
     def add_shell(self, build: ShapeBuilder, *, coarse: bool) -> None:
-        """Add panes, pillars, roof and headlining."""
-        build.grid(self.points, self.finish, flip=True)
-        build.grid(self.points * [1.0, -1.0, 1.0], self.finish)
+        build.both_sides(self.points, self.finish)
         edge = self.points[:, -1]
         across = np.array([1, 0, -1] if coarse else [1, 0.82, 0.45, 0, -0.45, -0.82, -1])
         build.chords(edge, across, self.roof_crown, Finish.BODY)
@@ -183,7 +178,6 @@ def add_cabin(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_seats(build: ShapeBuilder, skin: Skin) -> None:
-    """Add front seats, a bench, headrests and the steering wheel."""
     form = skin.form
     top = form.height - 0.27
     across = 0.205 * form.width
@@ -200,7 +194,6 @@ def add_seats(build: ShapeBuilder, skin: Skin) -> None:
 def _add_seat(
     build: ShapeBuilder, place: tuple[float, float], top: float, width: float, headrests: tuple[float, ...]
 ) -> None:
-    """Add a seat with the foot of its backrest at `place`; headrests at the given lateral offsets, m."""
     x, y = place
     cushion, back = top - 0.70, top - 0.16
     build.box(

@@ -31,8 +31,6 @@ BODY_SHARE = (0.37, 0.11, 0.16, 0.24, 0.10, 0.02)
 
 
 class SizeClass(NamedTuple):
-    """A market segment of one body, with minimum and maximum of each dimension, m."""
-
     segment: str
     share: float
     length: tuple[float, float]
@@ -74,8 +72,6 @@ SIZE_CLASSES: dict[str, tuple[SizeClass, ...]] = {
 
 
 class Paint(NamedTuple):
-    """A car paint, its share of the fleet, and the variation of its colour."""
-
     name: str
     share: float
     color: tuple[int, int, int]
@@ -100,17 +96,13 @@ sold, so some of today's grey is still silver. Colours are sRGB, 0 to 255."""
 
 
 def draw_body(rng: np.random.Generator) -> str:
-    """Draw a body by `BODY_SHARE`."""
     return BODIES[int(rng.choice(len(BODIES), p=BODY_SHARE))]
 
 
 def draw_size(body: str, rng: np.random.Generator) -> tuple[str, tuple[float, float, float]]:
-    """Draw a segment of a body, and length, width and height within its limits.
+    """Draw a segment of a body, and length, width and height, m, within its limits.
 
     The dimensions are correlated, since longer cars of a class tend to be wider, and concentrate around the middle.
-
-    Returns:
-        The segment's name; length, width, height in m.
     """
     classes = SIZE_CLASSES[body]
     chosen = classes[int(rng.choice(len(classes), p=[c.share for c in classes]))]
@@ -121,7 +113,6 @@ def draw_size(body: str, rng: np.random.Generator) -> tuple[str, tuple[float, fl
 
 
 def draw_paint(rng: np.random.Generator) -> tuple[int, int, int]:
-    """Draw a paint's colour, sRGB, by the shares in `PAINTS`."""
     paint = PAINTS[int(rng.choice(len(PAINTS), p=[p.share for p in PAINTS]))]
     drawn: NDArray[np.float64] = np.array(paint.color) + np.array(paint.spread) * rng.uniform(-1.0, 1.0)
     r, g, b = np.clip(np.round(drawn + rng.uniform(-3, 3, 3)), 0, 255).astype(int).tolist()

@@ -11,59 +11,40 @@ ARCH_GAP = 0.042  # m, between tyre and arch
 
 @dataclass(frozen=True)
 class Form:
-    """Lines of a body. Vehicle frame (x forward, y left, z up, origin on the ground under the centre), m.
+    """Lines of a body. Vehicle frame (x forward, y left, z up, origin on the ground under the centre), m."""
 
-    Attributes:
-        body: one of `vehicle_classes.BODIES`.
-        length, width, height: overall, without mirrors.
-        rear_axle, front_axle: x.
-        wheel_radius: outer radius of the tyres.
-        sill, belt, nose, deck: z of the lower edge, of the side windows' lower edge, of the bonnet's front edge
-            and of the body's upper edge at the tail.
-        cowl, header: x of the windscreen's lower and upper edge, at its corners.
-        roof_end, glass_end: x of the rear window's upper and lower edge (the cab's, for a pick-up), at its corners.
-        screen_bow, rear_bow: bulge of the windscreen and the rear window in plan.
-        tumblehome: inward lean of the side windows.
-        crown: height of the middle of the roof above its edges.
-        roof_drop: drop of the roof's edge from its highest point to the header and to its rear end.
-        nose_depth, tail_depth: length of the rounding of the plan at either end.
-        nose_power, tail_power: exponents of that rounding (superellipse); 2 is round, 4 boxy.
-        doors: doors per side, 1 or 2.
-        side_windows: panes per side, from the front; the others are sheet metal.
-        variety: (8,) in [0, 1], for choices of trim.
-    """
-
-    body: str
-    length: float
+    body: str  # one of `vehicle_classes.BODIES`
+    length: float  # overall, without mirrors
     width: float
     height: float
-    rear_axle: float
+    rear_axle: float  # x
     front_axle: float
-    wheel_radius: float
-    sill: float
-    belt: float
-    nose: float
-    deck: float
-    cowl: float
+    wheel_radius: float  # outer radius of the tyres
+    sill: float  # z of the lower edge
+    belt: float  # z of the side windows' lower edge
+    nose: float  # z of the bonnet's front edge
+    deck: float  # z of the body's upper edge at the tail
+    cowl: float  # x of the windscreen's lower edge, at its corners; `header`: of the upper one
     header: float
-    roof_end: float
+    roof_end: float  # x of the rear window's upper edge (the cab's, for a pick-up), at its corners; `glass_end`: lower
     glass_end: float
-    screen_bow: float
+    screen_bow: float  # bulge of the windscreen in plan; `rear_bow`: of the rear window
     rear_bow: float
-    tumblehome: float
-    crown: float
-    roof_drop: tuple[float, float]
-    nose_depth: float
+    tumblehome: float  # inward lean of the side windows
+    crown: float  # height of the middle of the roof above its edges
+    roof_drop: tuple[
+        float, float
+    ]  # of the roof's edge from its highest point to the header and to its rear end
+    nose_depth: float  # length of the rounding of the plan at either end
     tail_depth: float
-    nose_power: float
+    nose_power: float  # exponents of that rounding (superellipse); 2 is round, 4 boxy
     tail_power: float
-    doors: int
-    side_windows: int
-    variety: tuple[float, ...]
+    doors: int  # per side, 1 or 2
+    side_windows: int  # panes per side, from the front; the others are sheet metal
+    variety: tuple[float, ...]  # (8,) in [0, 1], for choices of trim
 
     @property
     def arch_radius(self) -> float:
-        """Radius of the wheel arches, m."""
         return self.wheel_radius + ARCH_GAP
 
     @property
@@ -90,14 +71,7 @@ _USUAL: dict[str, tuple[float, ...]] = {
 
 
 def draw_form(body: str, segment: str, size: tuple[float, float, float], rng: np.random.Generator) -> Form:
-    """Draw the proportions of a body of a given size.
-
-    Args:
-        body: one of `vehicle_classes.BODIES`.
-        segment: as in `vehicle_classes.SIZE_CLASSES`.
-        size: length, width, height, m.
-        rng: generator for all other proportions.
-    """
+    """Draw the proportions of a body of a given length, width and height, m."""
     length, width, height = size
     usual = np.array(_USUAL[body])
     delivery = body == "van" and segment == "N1"

@@ -44,7 +44,6 @@ _GLYPHS = (
 
 
 def wheel_shape(form: Form, *, coarse: bool) -> Shape:
-    """Return a wheel around the z axis; its outer face points up at z = 0."""
     build = ShapeBuilder()
     radius, width = form.wheel_radius, 0.185 + 0.12 * (form.wheel_radius - 0.28)
     rim = radius * (0.64 + 0.10 * form.variety[6])
@@ -87,7 +86,6 @@ def _add_spokes(build: ShapeBuilder, form: Form, rim: float) -> None:
 
 
 def add_wheels(build: ShapeBuilder, form: Form, *, coarse: bool) -> None:
-    """Add four wheels with their outer faces slightly inside the arches."""
     wheel = wheel_shape(form, coarse=coarse)
     out = form.width / 2 - 0.030
     for x in (form.rear_axle, form.front_axle):
@@ -108,13 +106,7 @@ def plate_places(skin: Skin) -> list[tuple[FloatArray, float]]:
 
 
 def add_plates(build: ShapeBuilder, skin: Skin, text: NDArray[np.int64]) -> None:
-    """Add the front and rear plate with the same dark characters.
-
-    Args:
-        build: the builder to add them to.
-        skin: the shell with the bumpers.
-        text: (n,) int64, index of each glyph.
-    """
+    """Add the front and rear plate with the same dark characters, indices of glyphs."""
     for at, facing in plate_places(skin):
         _add_plate(build, at, facing, text)
 
@@ -143,7 +135,6 @@ def _add_plate(build: ShapeBuilder, at: FloatArray, facing: float, text: NDArray
 
 
 def add_reflectors(build: ShapeBuilder, skin: Skin) -> None:
-    """Add two bright bowls to each headlamp."""
     first = len(skin.flank) - len(ROUND)
     lamp = np.flatnonzero(np.isclose(skin.plan_angle, LAMP_INNER))[-1]
     high = int(np.searchsorted(ROWS, 0.82))
@@ -166,32 +157,23 @@ def add_reflectors(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_slats(build: ShapeBuilder, skin: Skin) -> None:
-    """Add bright bars across the grille, and the maker's badge."""
     column = int(np.flatnonzero(np.isclose(skin.plan_angle, LAMP_INNER))[-1])
     for share in (0.62, 0.75):
         row = int(np.searchsorted(ROWS, share))
         part = (share + np.array([[-0.016], [0.016]]) - ROWS[row - 1]) / (ROWS[row] - ROWS[row - 1])
         low, high = skin.flank[column:, None, row - 1], skin.flank[column:, None, row]
         points = low + part * (high - low) + np.array([0.006, 0.0, 0.0])
-        build.grid(points, Finish.BRIGHT, flip=True)
-        build.grid(points * [1.0, -1.0, 1.0], Finish.BRIGHT)
+        build.both_sides(points, Finish.BRIGHT)
 
 
 def add_mirrors(build: ShapeBuilder, skin: Skin) -> None:
-    """Add a rounded housing on either side, with its glass to the rear."""
     form = skin.form
     x = form.cowl - 0.20
     foot = np.array([np.interp(x, skin.edge[:, 0], skin.edge[:, k]) for k in range(3)])
     tall = 0.135 if form.body not in ("van", "pickup") else 0.19
     turn = np.linspace(0.0, 2 * np.pi, 9)
     turn[-1] = 0.0
-    outline = np.stack(
-        [
-            np.sign(np.cos(turn)) * np.abs(np.cos(turn)) ** 0.7,
-            np.sign(np.sin(turn)) * np.abs(np.sin(turn)) ** 0.7,
-        ],
-        -1,
-    )
+    outline = np.stack([np.sign(unit) * np.abs(unit) ** 0.7 for unit in (np.cos(turn), np.sin(turn))], -1)
     rings = []
     for depth, scale in ((0.0, 0.96), (0.07, 1.0), (0.12, 0.72), (0.135, 0.0)):
         y = 0.095 * scale * outline[:, 0]
@@ -209,7 +191,6 @@ def add_mirrors(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_handles(build: ShapeBuilder, skin: Skin) -> None:
-    """Add a handle near the rear edge of every door."""
     for seam in skin.seams[1:]:
         x = seam + 0.15
         column = int(np.argmin(np.abs(skin.edge[:, 0] - x)))
@@ -225,7 +206,6 @@ def add_handles(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_rails(build: ShapeBuilder, house: Glasshouse) -> None:
-    """Add rails along the edges of the roof."""
     edge = house.points[:, -1]
     form = house.form
     front, rear = form.header - 0.18, form.roof_end + 0.16
@@ -235,12 +215,10 @@ def add_rails(build: ShapeBuilder, house: Glasshouse) -> None:
     z = np.interp(x, side[:, 0], side[:, 2]) + 0.2 * form.crown + np.array([-0.005, 0.03, 0.03, -0.005])
     section = np.array([[0.018, -0.02], [0.016, 0.012], [-0.016, 0.012], [-0.018, -0.02]])
     points = np.stack([np.column_stack([x, y + dy, z + dz]) for dy, dz in section], axis=1)
-    build.grid(points, Finish.RAIL, flip=True, smooth=False)
-    build.grid(points * [1.0, -1.0, 1.0], Finish.RAIL, smooth=False)
+    build.both_sides(points, Finish.RAIL, smooth=False)
 
 
 def add_cladding(build: ShapeBuilder, skin: Skin) -> None:
-    """Add plastic lips around the wheel arches."""
     form = skin.form
     lower = skin.flank[:, 0]
     for axle in (form.rear_axle, form.front_axle):
@@ -248,14 +226,6 @@ def add_cladding(build: ShapeBuilder, skin: Skin) -> None:
         hub = np.array([axle, 0.0, form.wheel_radius])
         radial = (arch - hub) * [1.0, 0.0, 1.0]
         wide = arch + 0.055 / form.arch_radius * radial
-        lip = np.stack(
-            [
-                arch + np.array([0, -0.02, 0]),
-                arch + np.array([0, 0.010, 0]),
-                wide + np.array([0, 0.008, 0]),
-                wide + np.array([0, -0.02, 0]),
-            ],
-            axis=1,
-        )
-        build.grid(lip, Finish.CLADDING, flip=True)
-        build.grid(lip * [1.0, -1.0, 1.0], Finish.CLADDING)
+        lines = ((arch, -0.02), (arch, 0.010), (wide, 0.008), (wide, -0.02))
+        lip = np.stack([line + np.array([0, out, 0]) for line, out in lines], axis=1)
+        build.both_sides(lip, Finish.CLADDING)

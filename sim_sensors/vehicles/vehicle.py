@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from sim_sensors.camera.surfaces import Shape, ShapeBuilder
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, require_seed
 from sim_sensors.mesh import Material, Mesh
 from sim_sensors.vehicles import bodies, parts
 from sim_sensors.vehicles.bodies import Finish, Skin
@@ -55,8 +55,7 @@ class VehicleModel:
     def __post_init__(self) -> None:
         if self.body not in BODIES:
             raise SensorError(f"body is {self.body!r}, want one of {', '.join(BODIES)}")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
-            raise SensorError(f"seed is {self.seed!r}, want an integer, 0 or more")
+        require_seed(self.seed)
         limits = ((3.2, 6.0), (1.5, 2.2), (1.3, 2.2))
         for name, value, (low, high) in zip(("length", "width", "height"), self.size, limits, strict=True):
             if not low <= value <= high:
@@ -74,8 +73,7 @@ class VehicleModel:
         """
         if body is not None and body not in BODIES:
             raise SensorError(f"body is {body!r}, want one of {', '.join(BODIES)}")
-        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-            raise SensorError(f"seed is {seed!r}, want an integer, 0 or more")
+        require_seed(seed)
         rng = np.random.default_rng([int(seed), 1])
         drawn = draw_body(rng)
         chosen = drawn if body is None else body
@@ -129,7 +127,6 @@ class VehicleModel:
         return _footprint(self.painted((0, 0, 0))).copy()
 
     def _palette(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return material and colour of every `Finish`."""
         rng = np.random.default_rng([self.seed, 3])
         variety = self.form.variety
         paint = np.array(self.paint, dtype=np.float64)
@@ -139,15 +136,12 @@ class VehicleModel:
         plastic = np.array([44.0, 45.0, 47.0]) + rng.uniform(-8, 10)
         cabin = np.array([40.0, 40.0, 42.0]) + rng.uniform(-12, 22)
         seat = cabin * rng.uniform(0.9, 1.25) if rng.random() < 0.8 else np.array([128.0, 112.0, 92.0])
-        rim = (
-            np.array([168.0, 170.0, 173.0]) * rng.uniform(0.75, 1.1)
-            if rng.random() < 0.78
-            else np.full(3, 38.0)
-        )
+        silver = np.array([168.0, 170.0, 173.0])
+        rim = silver * rng.uniform(0.75, 1.1) if rng.random() < 0.78 else np.full(3, 38.0)
         bright = np.array([196.0, 198.0, 200.0]) if variety[2] < 0.6 else np.array([26.0, 26.0, 28.0])
         dusty = paint + (0.05 + 0.25 * dirt) * (_DUST - paint)
         dirty = paint + (0.12 + 0.55 * dirt) * (_DUST - paint)
-        body_colored = variety[1] < 0.75
+        handle = (Material.PAINT, paint) if variety[1] < 0.75 and not plain else (Material.TRIM, plastic)
         table: dict[Finish, tuple[Material, FloatArray | tuple[int, int, int]]] = {
             Finish.BODY: (Material.PAINT, paint),
             Finish.BODY_DUSTY: (Material.PAINT, dusty),
@@ -175,12 +169,8 @@ class VehicleModel:
             Finish.CABIN: (Material.INTERIOR, cabin),
             Finish.HEADLINER: (Material.INTERIOR, (120, 118, 114)),
             Finish.UNDERSIDE: (Material.TRIM, (14, 14, 14)),
-            Finish.MIRROR: (Material.PAINT, paint)
-            if body_colored and not plain
-            else (Material.TRIM, plastic),
-            Finish.HANDLE: (Material.PAINT, paint)
-            if body_colored and not plain
-            else (Material.TRIM, plastic),
+            Finish.MIRROR: handle,
+            Finish.HANDLE: handle,
             Finish.RAIL: (Material.CHROME, bright),
             Finish.PILLAR: (Material.TRIM, (20, 20, 21)),
         }
@@ -199,7 +189,6 @@ def _skin(model: VehicleModel, coarse: bool) -> Skin:
 
 @lru_cache(maxsize=2 * _SHAPES_KEPT)
 def _shape(model: VehicleModel, level: int) -> Shape:
-    """Return the triangles of a model without paint."""
     coarse = level == COARSE
     form, skin, build = model.form, _skin(model, coarse), ShapeBuilder()
     house = Glasshouse(skin)
@@ -243,7 +232,6 @@ def _footprint(model: VehicleModel) -> FloatArray:
 
 
 def _convex_hull(points: FloatArray) -> FloatArray:
-    """Return the convex hull, (k, 2), counter-clockwise, without collinear corners (Andrew's monotone chain)."""
     ordered = np.unique(np.round(points, 9), axis=0)
 
     def chain(row: list[list[float]]) -> list[list[float]]:

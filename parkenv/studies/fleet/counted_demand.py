@@ -10,7 +10,7 @@ import numpy as np
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
-from parkenv.forecast.baselines import last_week
+from parkenv.forecast.comparison import last_week
 from parkenv.forecast.counts import Counts
 from parkenv.scenarios.build import build
 from parkenv.scenarios.purposes import PurposeSpec, demand_of

@@ -34,25 +34,12 @@ BOX_COLUMNS = (
 know it."""
 
 
-class VideoCars(NamedTuple):
-    """The cars in a video."""
-
-    row: Row  # of the video: file, frames, seconds, fps, boxes, most_cars
-    boxes: list[Row]  # rows of `boxes.csv`
-
-
 class FoundCars(NamedTuple):
-    """The cars in images and videos.
+    """The cars in images and videos."""
 
-    Attributes:
-        images: number of images.
-        videos: a row for each video: file, frames, seconds, fps, boxes, most_cars.
-        boxes: rows of `boxes.csv`.
-    """
-
-    images: int
-    videos: list[Row]
-    boxes: list[Row]
+    images: int  # their number
+    videos: list[Row]  # of each video: file, frames, seconds, fps, boxes, most_cars
+    boxes: list[Row]  # rows of `boxes.csv`
 
 
 def find_cars(
@@ -63,44 +50,38 @@ def find_cars(
     folder: Path | None = None,
     progress: Progress = lambda *_: None,
 ) -> FoundCars:
-    """Find cars in images, videos and recorded drives, and draw them on request.
+    """Find cars in files or folders of images, videos and recorded drives.
 
-    Args:
-        paths: files, or folders of them.
-        detector: what looks at them.
-        threshold: least probability of a reported car.
-        step: of a video, every `step`-th frame is looked at.
-        folder: where pictures, films and boxes.csv go; None to draw nothing.
-        progress: called as frames are finished.
+    Of a video every `step`-th frame is looked at. Pictures, films and boxes.csv go into a folder, if there is one.
     """
     chosen = require_readable(paths)  # a damaged one is refused before any work
-    files = [one if isinstance(one, Path) else one.file for one in chosen]
-    suffixes = [".png" if isinstance(one, Path) else ".mp4" for one in chosen]
+    files = [source if isinstance(source, Path) else source.file for source in chosen]
+    suffixes = [".png" if isinstance(source, Path) else ".mp4" for source in chosen]
     drawings = [
         file_name(f"{name}_cars", suffix)
         for name, suffix in zip(distinct_names(files), suffixes, strict=True)
     ]
     if folder is not None:
-        originals = {(one if isinstance(one, Path) else one.path).resolve() for one in chosen}
+        originals = {(source if isinstance(source, Path) else source.path).resolve() for source in chosen}
         for drawing in drawings:
             if (folder / drawing).resolve() in originals:
                 kind = "a video" if drawing.endswith(".mp4") else "an image"
                 raise InputError(f"--out {folder}: {drawing} would replace {kind} that is searched")
         make_folder(folder)
-    counts = [1 if isinstance(one, Path) else one.frames and -(-one.frames // step) for one in chosen]
+    counts = [1 if isinstance(s, Path) else s.frames and -(-s.frames // step) for s in chosen]
     total = 0 if None in counts else sum(count or 0 for count in counts)  # 0 where it is not known
     advance = counted(progress, "Detecting", total)
     boxes: list[Row] = []
     videos: list[Row] = []
-    for one, drawing in zip(chosen, drawings, strict=True):
+    for source, drawing in zip(chosen, drawings, strict=True):
         drawn = None if folder is None else folder / drawing
-        if isinstance(one, Path):
-            boxes += detect_in_image(one, detector, threshold, drawn)
+        if isinstance(source, Path):
+            boxes += detect_in_image(source, detector, threshold, drawn)
             advance()
         else:
-            found = detect_in_video(one, detector, threshold, step, drawn, advance)
-            videos.append(found.row)
-            boxes += found.boxes
+            row, in_video = detect_in_video(source, detector, threshold, step, drawn, advance)
+            videos.append(row)
+            boxes += in_video
     if folder is not None:
         write_csv(folder / "boxes.csv", BOX_COLUMNS, boxes)
     return FoundCars(len(chosen) - len(videos), videos, boxes)
@@ -148,8 +129,8 @@ def detect_in_video(
     step: int = 1,
     drawn: Path | None = None,
     on_frame: Callable[[], None] = lambda: None,
-) -> VideoCars:
-    """Return the cars in every `step`-th frame of a video, and draw them into a film (MP4) of equal speed."""
+) -> tuple[Row, list[Row]]:
+    """Return the rows of a video and of the cars in every `step`-th frame, and draw them into a film of equal speed."""
     boxes: list[Row] = []
     frames = most = 0
     seconds = 0.0
@@ -167,7 +148,7 @@ def detect_in_video(
         if not frames:
             raise InputError(f"{video.name}: has no frame that can be read")
     row = {"file": video.name, "frames": frames, "seconds": round(seconds + 1.0 / video.fps, 3)}
-    return VideoCars(row | {"fps": video.fps, "boxes": len(boxes), "most_cars": most}, boxes)
+    return row | {"fps": video.fps, "boxes": len(boxes), "most_cars": most}, boxes
 
 
 def _likely(found: Detections, threshold: float) -> Detections:

@@ -47,20 +47,10 @@ def add_recording(
 ) -> Row:
     """Add a recorded drive to the map in a folder, draw the map, and list the located cars (`cars.csv`).
 
-    Args:
-        recording: an MCAP file, a rosbag, a folder of photographs or a film.
-        scenario: the lot that was driven through.
-        folder: holds the map, and gets the picture.
-        calibration: sensors, mounts and topics; None for those of the recording.
-        detector: what looks at the images.
-        every: least distance between captures, m.
-        localise: what corrects the poses.
-        photos: of photographs or a film, where the poses are, and what the camera is.
-        lot_file: of the lot; one in degrees says where poses in degrees are.
-        progress: called as captures are mapped; how many there will be is not known.
-
-    Returns:
-        What was found: captures, slots seen and taken, cars, and the errors and largest correction of poses, m.
+    `recording` is an MCAP file, a rosbag, a folder of photographs or a film; `photos` says of the latter where the
+    poses are, and what the camera is. Without a `calibration` the recording has sensors, mounts and topics. Captures
+    are at least `every` m apart. A lot file in degrees says where poses in degrees are. Return what was found:
+    captures, slots seen and taken, cars, and the errors and largest correction of poses, m.
     """
     finder = make_detector(detector)
     progress("Reading", 0, 0)

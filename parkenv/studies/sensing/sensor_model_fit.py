@@ -71,11 +71,7 @@ def _taken_rates(reported: IntArray) -> tuple[float, float]:
 
 
 class _ObservationCounter(Observer):
-    """Counts what the perception pipeline reports after each step of a search, until the car is parked.
-
-    Args:
-        scenario: the scenario.
-    """
+    """Counts what the perception pipeline reports after each step of a search, until the car is parked."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._starts, self._slots = scenario.slots_in_view
@@ -85,12 +81,10 @@ class _ObservationCounter(Observer):
         self.counts = ObservationCounts.none()
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Store the environment."""
         del observation
         self._env: Any = env.unwrapped
 
     def on_step(self, step: Step) -> None:
-        """Compare the report with the true occupancy."""
         if step.info["parked"]:
             return
         state, observed = self._env.state, self._env.perception.observation
@@ -112,13 +106,8 @@ def count_observations(
 ) -> ObservationCounts:
     """Search with simulated sensors, and compare the perception pipeline's reports with the true occupancy.
 
-    Args:
-        scenario: the scenario.
-        rig: `laser` or `stereo`.
-        agent: name of the agent that searches.
-        seeds: one seed per search.
-        weather: the weather; None to draw it for each search.
-        detector: the detector; None: the scenario's.
+    There is one seed per search. The weather is drawn for each search, and the detector the scenario's, if none is
+    given.
     """
     scenario = scenario.replace(sensor_model=_ASSUMED)
     env = gym.make(
@@ -141,18 +130,7 @@ def measure_sensors(
     workers: Workers = SERIAL,
     on_progress: Callable[[], None] = lambda: None,
 ) -> ObservationCounts:
-    """Sum `count_observations` over all agents of `AGENTS` and all scenarios.
-
-    Args:
-        scenarios: the scenarios.
-        rig: `laser` or `stereo`.
-        searches: number of searches per agent and scenario.
-        seed: seed of the first search.
-        weather: the weather; None to draw it for each search.
-        detector: the detector; None: the scenario's.
-        workers: where the searches run; results do not depend on it.
-        on_progress: called after each search.
-    """
+    """Sum `count_observations` over all agents of `AGENTS` and all scenarios, with a number of searches of each."""
     tasks = [
         partial(count_observations, scenario, rig, agent, [s], weather, detector)
         for scenario in scenarios

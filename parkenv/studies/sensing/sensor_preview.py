@@ -36,14 +36,8 @@ def preview_sensors(
 ) -> None:
     """Draw images, depth, disparity and scan at the place with the most parked cars, and film the way past it.
 
-    Args:
-        scenario: the scenario with its traffic.
-        folder: where the pictures and drive.gif go.
-        weathers: a figure is drawn for each; the film has the first.
-        drive: length of the film, m; 0 for none.
-        every: distance between its frames, m.
-        seed: seed of the world, the light and the noise.
-        progress: called as pictures are rendered.
+    There is a figure for each weather. The film, drive.gif, has the first one, is `drive` long, m (0: none), with
+    frames `every` m.
     """
     make_folder(folder)
     key = world_key(seed, 0)

@@ -216,6 +216,6 @@ class SurveyStudy(Study):
         return super().page(summary, folder)._replace(tables=tables)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
-        from parkenv.studies.sensing.drive_replay import DriveReplay
+        from parkenv.studies.sensing.surveys import DriveReplay
 
         return [DriveReplay(self.built, self.drive_settings, len(self.table.read(folder)))]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +17,11 @@ from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.distance_bins import DISTANCE_ENDS
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.store import MapStore
-from parkenv.mapping.survey import SessionResult, SurveySettings
+from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
 from parkenv.mapping.survey_score import METHODS
 from parkenv.show.plurals import plural
+from parkenv.studies.report import Recording, ReplayJob
+from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, MAP_FILE, SESSION_COLUMNS
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -48,14 +52,9 @@ def session_row(result: SessionResult) -> Row:
 
 def _pose_errors(result: SessionResult) -> tuple[float, float, float]:
     """Return the root mean square error of the odometry's positions, m, that of the estimated ones, and its maximum."""
-    odometry, estimated = (
-        np.hypot(*(poses - result.true_poses)[:, :2].T) for poses in (result.odometry, result.poses)
-    )
-    return (
-        float(np.sqrt((odometry**2).mean())),
-        float(np.sqrt((estimated**2).mean())),
-        float(estimated.max()),
-    )
+    errors = [np.hypot(*(poses - result.true_poses)[:, :2].T) for poses in (result.odometry, result.poses)]
+    odometry, estimated = (float(np.sqrt((error**2).mean())) for error in errors)
+    return odometry, estimated, float(errors[1].max())
 
 
 def _error_columns(errors: FloatArray) -> tuple[float, ...]:
@@ -131,12 +130,8 @@ def slots_found(store: MapStore, sessions: int) -> FoundSlots:
 def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
     """Return how often a clearly visible parked car is detected in a frame, by weather and distance.
 
-    Args:
-        rows: rows of sessions.
-
-    Returns:
-        Rows with weather, distance_m (both ends of the bin), in_frame, detected, rate and its 95 % interval
-        (Wilson's), for every bin that holds a car.
+    The rows have both ends of the bin in distance_m, and the rate with its 95 % interval (Wilson's), for every bin that
+    holds a car.
     """
     from scipy.stats import binomtest
 
@@ -165,14 +160,9 @@ def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
 def draw_survey(
     scenario: Scenario, settings: SurveySettings, row: Row, shown: SessionResult | None, folder: Path
 ) -> None:
-    """Draw the pictures of a survey into its folder.
+    """Draw the pictures of a survey, from its row of `summary.json`, into its folder, which has the map.
 
-    Args:
-        scenario: the scenario.
-        settings: settings of the survey.
-        row: its row of `summary.json`.
-        shown: the first session, with perception results; None if it was not driven in this run.
-        folder: the folder, with the map.
+    `shown` is the first session, with perception results; None if it was not driven in this run.
     """
     from parkenv.show.figures import survey as pictures  # loads Matplotlib
 
@@ -199,6 +189,27 @@ def draw_survey(
     pictures.save_found_slots(lot, found, score_discovery(found, lot), path("slots_found"))
 
 
+class DriveReplay(NamedTuple):
+    """The drives of a survey, driven again for a report."""
+
+    scenario: Scenario
+    settings: SurveySettings
+    sessions: int
+
+    def again(self, options: ReportOptions) -> ReplayJob:
+        numbers = range(min(options.sessions, self.sessions) if options.drives is None else 0)
+        frames = options.frames // max(len(numbers), 1)
+        return ReplayJob(
+            [partial(_driven_again, self.scenario, self.settings, number, frames) for number in numbers]
+        )
+
+
+def _driven_again(scenario: Scenario, settings: SurveySettings, number: int, frames: int) -> Recording:
+    from parkenv.show.report.drive_recording import record_drive
+
+    return record_drive(Survey(scenario, settings), number, most_frames=frames)[1]
+
+
 def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArray:
     """Return the true P(taken) of every slot in the middle of a window, (n_slots,), as a reference for maps.
 
@@ -215,16 +226,10 @@ def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArr
 
 
 def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: SessionLog) -> tuple[float, float]:
-    """Return the mean absolute error of the map's predictions, and the error expected of raw counts.
+    """Return the mean absolute error of the map's predictions in the middle of the windows, on their first days.
 
-    Args:
-        scenario: the scenario with the true occupancy.
-        windows: time windows of the sessions; the map predicts the middle of each, on its first day.
-        log: the map's sessions.
-
-    Returns:
-        Mean over slots and windows of |predicted - true|; and the expected error of raw counts, i.e. of the mean of
-        independent draws at the middle of the window, one per session in the window.
+    And the error that is expected of raw counts, i.e. of the mean of independent draws at the middle of the window, one
+    per session in the window.
     """
     errors, chances = [], []
     hour = log.time % DAY_S
