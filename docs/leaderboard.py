@@ -1,8 +1,8 @@
 """The tables on the page of the leaderboard, made from its result files: `python docs/leaderboard.py`."""
 
+import re
 from pathlib import Path
 
-from parkenv.cli.compare import with_short_labels
 from parkenv.show.plurals import interval_text
 from parkenv.studies.benchmark.page import entries_of, neighbours, ranking, result_files
 from parkenv.studies.benchmark.result_file import check_result
@@ -38,8 +38,9 @@ def tables():
         for row in neighbours(suite, entries)
     ]
     made = {"ranking": "\n".join(lines), "pairs": "\n".join(pairs)}
-    for row, brief in zip(rows, with_short_labels(rows), strict=True):
-        made = {name: table.replace(row["agent"], brief["agent"]) for name, table in made.items()}
+    for agent in (row["agent"] for row in rows):
+        brief = re.sub(r":[^()]*[/\\]", ":", agent)  # without the folders of its file
+        made = {name: table.replace(agent, brief) for name, table in made.items()}
     return made
 
 

@@ -14,9 +14,9 @@ from command_line import parkenv
 from parkenv import InputError
 from parkenv.cli import COMMANDS as LISTED
 from parkenv.cli import app
-from parkenv.cli.compare import LEVELS, Compare
-from parkenv.cli.options import command_class, field_options, made
+from parkenv.cli.options import command_class, field_options, spec_of
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, RigName
+from parkenv.studies.compare.comparison import LEVELS
 from planners.names import AGENTS
 from sim_sensors.camera.weather import PRESETS
 from sim_sensors.rig import RIG_NAMES
@@ -84,7 +84,7 @@ def test_a_number_out_of_its_range_is_refused_by_every_command(entry):
         bounds = [mark.ge for mark in option.field.metadata if isinstance(mark, Ge)]
         if bounds and option.option.parse is None:
             with pytest.raises(InputError, match=rf"^{option.name} is -?[\d.]+, want a number of at least"):
-                made(option.model, {option.name: str(bounds[0] - 1)})
+                spec_of(option.model, {option.name: str(bounds[0] - 1)})
 
 
 def test_names_are_those_of_the_modules_behind_them():
@@ -197,7 +197,7 @@ def test_agents_and_scenarios_are_listed_in_help():
     ],
 )
 def test_a_sweep_keeps_the_levels_that_are_given(given, levels, blind):
-    grid = Compare.of({"--scenario": "mini", **given}).study.grid
+    grid = command_class("compare").of({"--scenario": "mini", **given}).study.grid
     assert (grid.occupancy_levels, grid.blind) == (levels, blind)
 
 

@@ -87,7 +87,7 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
     )  # fmt: skip
     assert [p.name for p in tmp_path.glob("*.png")] == ["time_against_failure_cost_mini.png"]
     # A row of each agent, with and without observations, and a column of each cost.
-    assert len(re.findall(r"^ (?:greedy-drive|mdp-tuned)(?: +\d+\.\d){13} *$", done.stdout, re.M)) == 3
+    assert len(re.findall(r"(?:greedy-drive|mdp-tuned)(?: +\d+\.\d){13} *$", done.stdout, re.M)) == 3
     rows = summary_of(tmp_path)["rows"]
     tries = {(r["scenario"], r["failure_cost_s"]): r for r in rows if r["agent"] == "greedy-drive"}
     assert len(tries) == 26

@@ -159,7 +159,7 @@ DAY = "2024-01-29"
     [
         (["--car-park", "P9", "--replay-from", DAY], "'P9'"),
         (["--car-park", "P0", "--replay-from", "2024-01-03"], "2024-01-08"),
-        (["--car-park", "P0"], "--car-park requires"),
+        (["--car-park", "P0"], "car_parks only together with"),
         (["--car-park", "P0", "--replay-from", DAY, "--forecast-from", "others"], "rolling or past"),
     ],
 )

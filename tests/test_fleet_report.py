@@ -99,8 +99,8 @@ def test_days_and_agents_can_be_chosen(run, tmp_path):
     make_report(run, ExecutionSpec(jobs=1), ReportOptions(episodes=0), out=made)
     assert data_of(made)["fleets"] == []
     for options, message in (
-        ({"numbers": (2,)}, "--replay has 2; this run's are 0 to 1"),
-        ({"agents": ("belief",)}, "--agents has 'belief'; known: greedy-drive"),
+        ({"numbers": (2,)}, "2; .* 0 to 1"),
+        ({"agents": ("belief",)}, "'belief'; known: greedy-drive"),
     ):
         with pytest.raises(InputError, match=message):
             make_report(run, ExecutionSpec(jobs=1), ReportOptions(**options), out=made)

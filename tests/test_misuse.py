@@ -15,6 +15,7 @@ OPTIONS = {
     "parkenv/SearchPerception-v2": {"scenario": "mini"},
     "parkenv/Drive-v1": {"lot": "mini"},
 }
+MAKERS = (gym.make, lambda name, **options: gym.make_vec(name, 2, **options))
 EVERY_ID = pytest.mark.parametrize("name", OPTIONS)
 EVERY_LOT = pytest.mark.parametrize("make", [lot_v0.raw_env, lot_v0.parallel_env])
 
@@ -24,31 +25,32 @@ def test_every_registered_id_is_tested():
 
 
 @EVERY_ID
-def test_an_unknown_keyword_is_a_type_error_as_of_any_python_function(name):
+@pytest.mark.parametrize("make", MAKERS)
+def test_an_unknown_keyword_is_a_type_error_as_of_any_python_function(make, name):
     """TorchRL's `GymEnv` asks every environment for `frameskip`, and understands nothing else."""
-    for make in (gym.make, lambda *a, **k: gym.make_vec(a[0], 2, **k)):
-        with pytest.raises(TypeError, match=r"\(\) got an unexpected keyword argument 'frameskip'"):
-            make(name, frameskip=4, **OPTIONS[name])
+    with pytest.raises(TypeError, match=r"\(\) got an unexpected keyword argument 'frameskip'"):
+        make(name, frameskip=4, **OPTIONS[name])
 
 
-def test_a_misspelt_argument_of_the_environment_itself_has_a_hint():
-    for make in (gym.make, lambda *a, **k: gym.make_vec(a[0], 2, **k)):
-        with pytest.raises(TypeError, match=r"Env\(\) .*'observaton'; did you mean 'observation'"):
-            make("parkenv/Search-v2", observaton="local")
-    for make in (lot_v0.env, lot_v0.parallel_env):
-        with pytest.raises(TypeError, match=r"did you mean 'background'"):
-            make(backgrund="none")
-
-
-def test_a_number_of_slots_needs_the_local_observation():
-    for make in (gym.make, lambda *a, **k: gym.make_vec(a[0], 2, **k)):
-        with pytest.raises(InputError, match="k is 3, want None"):
-            make("parkenv/Search-v2", scenario="mini", k=3)
+@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"observaton": "local"}, TypeError, "'observaton'; did you mean 'observation'"),
+        ({"k": 3}, InputError, "k is 3"),
+        ({"flat": True}, InputError, "flat is True"),
+        ({"reward_scale": 0.0}, InputError, r"reward_scale is 0\.0"),
+        ({"observation": "hidden"}, InputError, "full, occupancy, local"),
+    ],
+)
+def test_a_wrong_argument_of_a_search_is_named(make, options, error, message):
+    with pytest.raises(error, match=message):
+        make("parkenv/Search-v2", scenario="mini", **options)
 
 
 def test_other_makers_say_it_alike_and_name_what_is_near():
     for make in (lot_v0.env, lot_v0.parallel_env, lambda **k: make_scenario("mini", **k)):
-        with pytest.raises(TypeError, match=r"unexpected keyword argument 'failure_cost'.*'failure_s'"):
+        with pytest.raises(TypeError, match=r"'failure_cost'.*'failure_s'"):
             make(failure_cost=3.0)
     with pytest.raises(TypeError, match="frameskip"):
         SearchVecEnv(2, "mini", frameskip=4)

@@ -7,7 +7,7 @@ import pytest
 from small_lots import CAR_PARKS
 
 from parkenv import InputError, make_scenario
-from parkenv.cli.options import made as changed_by
+from parkenv.cli.options import spec_of as changed_by
 from parkenv.engine.records import FORECAST
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot, packaged_lot, write_lot

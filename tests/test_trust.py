@@ -1,12 +1,11 @@
 """Code that files name runs only when the user trusts it, and a user's agents keep their names."""
 
-import csv
 import json
 import sys
 from pathlib import Path
 
 import pytest
-from command_line import parkenv
+from command_line import ran, refused, rows_in, summary_of
 
 AGENT = """
 from pathlib import Path
@@ -46,63 +45,47 @@ def experiment(path, kind, module):
 
 @pytest.mark.parametrize("kind", EXPERIMENTS)
 def test_an_experiment_file_that_names_a_class_shows_it_and_asks_for_trust(module, tmp_path, kind):
-    refused = parkenv("run", experiment(tmp_path / "theirs.json", kind, module))
-    message = " ".join(refused.stderr.split())
-    assert refused.returncode == 2
+    message = refused("run", experiment(tmp_path / "theirs.json", kind, module))
     assert f"theirs.json: would run {module}:Mine ({tmp_path / module}.py); read that code" in message
     assert not (tmp_path / "was_run").exists()
     assert not (tmp_path / "results").exists()
 
 
 def test_a_cluster_in_a_file_asks_for_trust(tmp_path):
-    file = tmp_path / "theirs.json"
-    file.write_text(
-        json.dumps({"agents": ["mdp"], "backend": "dask", "address": "tcp://theirs.example:8786"})
-    )
-    refused = parkenv("run", file, "--out", tmp_path / "out")
-    assert refused.returncode == 2
-    assert "would run tasks on the cluster at tcp://theirs.example:8786" in " ".join(refused.stderr.split())
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_cluster_in_a_run_folder_asks_for_trust_whoever_searches(tmp_path):
     cluster = {"backend": "dask", "address": "tcp://theirs.example:8786"}
     compared = {"kind": "compare", "scenarios": ["mini"], "agents": ["theirs:Mine"]} | cluster
     (tmp_path / "experiment.json").write_text(json.dumps(compared))
-    command = ("compare", "--resume", "--agents", "mdp", "--out", tmp_path)
-    refused = " ".join(parkenv(*command).stderr.split())
-    assert "would run tasks on the cluster at tcp://theirs.example:8786; read" in refused
-    assert "holds no compare run to resume" in parkenv(*command, "--backend", "loky").stderr
+    asked = f"would run tasks on the cluster at {cluster['address']}; read"
+    resumed = ("compare", "--resume", "--agents", "mdp", "--out", tmp_path)
+    assert asked in refused(*resumed)
+    assert "holds no compare run to resume" in refused(*resumed, "--backend", "loky")
+    (tmp_path / "experiment.json").rename(tmp_path / "theirs.json")
+    (tmp_path / "theirs.json").write_text(json.dumps({"agents": ["mdp"]} | cluster))
+    assert asked in refused("run", tmp_path / "theirs.json", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_run_folder_that_names_a_class_asks_for_trust_and_the_class_names_the_agent(module, tmp_path):
     mark, out = tmp_path / "was_run", tmp_path / "out"
-    done = parkenv("run", experiment(tmp_path / "theirs.json", "compare", module), "--out", out, "--trust")
-    assert done.returncode == 0, done.stderr
+    ran("run", experiment(tmp_path / "theirs.json", "compare", module), "--out", out, "--trust")
     assert mark.exists()
-    assert [row["agent"] for row in json.loads((out / "summary.json").read_text())["rows"]] == ["mdp", "mine"]
-    with (out / "episodes.csv").open() as file:
-        assert [row["agent"] for row in csv.DictReader(file)] == ["mdp"] * 2 + ["mine"] * 2
+    assert [row["agent"] for row in summary_of(out)["rows"]] == ["mdp", "mine"]
+    assert [row["agent"] for row in rows_in(out / "episodes.csv")] == ["mdp"] * 2 + ["mine"] * 2
     sys.modules.pop(module)
     mark.unlink()
     for command in (("report", out), ("run", out, "--resume"), ("compare", "--resume", "--out", out)):
-        refused = parkenv(*command)
-        assert (refused.returncode, "add --trust" in refused.stderr) == (2, True), refused.stderr
+        assert "add --trust" in refused(*command)
     assert not mark.exists()
-    done = parkenv("report", out, "--trust", "--jobs", 1, "--episodes", 1)
-    assert done.returncode == 0, done.stderr
-    assert "Note" not in done.stdout
+    assert "Note" not in ran("report", out, "--trust", "--jobs", 1, "--episodes", 1).stdout
     assert mark.exists()
 
 
 def test_agents_on_the_command_line_are_the_users_own_choice(module, tmp_path):
     command = ["compare", "--scenario", "mini", "--episodes", 1, "--occupancy-levels", "none", "--no-figures"]
     command += ["--jobs", 1, "--out", tmp_path / "out", "--agents"]
-    done = parkenv(*command, f"mdp,{module}:Mine", "--report")
-    assert done.returncode == 0, done.stderr
+    ran(*command, f"mdp,{module}:Mine", "--report")
     (tmp_path / f"{module}_too.py").write_text(AGENT)
-    done = parkenv(*command, f"{module}:Mine,{module}_too:Mine", "--overwrite")
-    assert (done.returncode, "two agents are called 'mine'" in done.stderr) == (2, True)
+    assert "'mine'" in refused(*command, f"{module}:Mine,{module}_too:Mine", "--overwrite")
 
 
 WORLD = (Path(__file__).with_name("timetable_world.py")).read_text() + '\nopen("was_run", "w").close()\n'
@@ -112,20 +95,15 @@ def test_a_world_of_ones_own_is_named_on_the_command_line_and_by_no_scenario_fil
     mark, out = tmp_path / "was_run", tmp_path / "out"
     (tmp_path / f"{module}.py").write_text(WORLD)
     (tmp_path / "theirs.toml").write_text(f'lot = "mini"\noccupancy = "{module}:Timetable"')
-    refused = parkenv("compare", "--scenario", "theirs.toml")
-    assert refused.returncode == 2
-    assert "no class in a scenario file" in " ".join(refused.stderr.split())
+    assert "no class in a scenario file" in refused("compare", "--scenario", "theirs.toml")
     assert not mark.exists()
     own = f"--scenario mini --occupancy {module}:Timetable(taken_s=1100) --jobs 1 --no-figures"
-    done = parkenv(f"compare {own} --agents first-free,oracle -n 3 --out", out)
-    assert done.returncode == 0, done.stderr
-    first_free, oracle = json.loads((out / "summary.json").read_text())["rows"]
+    ran(f"compare {own} --agents first-free,oracle -n 3 --out", out)
+    first_free, oracle = summary_of(out)["rows"]
     assert first_free["total_s"] > oracle["total_s"]
-    driven = parkenv(f"fleet {own} --arrivals-per-hour 10 --knows own -n 1 --out", tmp_path / "fleet")
-    assert driven.returncode == 0, driven.stderr
+    ran(f"fleet {own} --arrivals-per-hour 10 --knows own -n 1 --out", tmp_path / "fleet")
     mark.unlink()
     sys.modules.pop(module)
     for command in (("report", out), ("compare", "--resume", "--out", out, "--hours", "08:00-09:00")):
-        refused = parkenv(*command)
-        assert (refused.returncode, "add --trust" in refused.stderr) == (2, True), refused.stderr
+        assert "add --trust" in refused(*command)
     assert not mark.exists()

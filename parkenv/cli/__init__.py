@@ -27,22 +27,22 @@ START, AGENTS, CROWDS, SENSE, DRIVE, DATA = (
     "Start here", "Agents", "Many drivers", "Sensors and maps", "Manoeuvres", "Lots, logs and files",
 )  # fmt: skip
 COMMANDS = {
-    "demo": Entry("Survey a lot with simulated sensors, then search in it.", "demo:Demo", START),
-    "compare": Entry("Compare agents in the same worlds.", "compare:Compare", START),
-    "play": Entry("Play the search yourself, in the worlds of the agents.", "play:Play", START),
+    "demo": Entry("Survey a lot with simulated sensors, then search in it.", "demo", START),
+    "compare": Entry("Compare agents in the same worlds.", "compare", START),
+    "play": Entry("Play the search yourself, in the worlds of the agents.", "report:Play", START),
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", START),
     "run": Entry("Run an experiment file.", "study_command:Run", START),
-    "train": Entry("Train agents by reinforcement learning.", "train:Train", AGENTS),
+    "train": Entry("Train agents by reinforcement learning.", "train", AGENTS),
     "plan": Entry("Draw planned searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", AGENTS),
     "benchmark": Entry("Run the benchmark suite, and check the results of others.", heading=AGENTS),
-    "benchmark run": Entry("Run agents through all episodes of the suite.", "benchmark:RunSuite"),
+    "benchmark run": Entry("Run agents through all episodes of the suite.", "benchmark"),
     "benchmark check": Entry("Check results of the suite, and print them side by side.", "benchmark:Check"),
     "benchmark page": Entry("Check results of the suite, and write a page of them.", "benchmark:Page"),
     "benchmark show": Entry("Show the tasks and settings of the suite.", "benchmark:Show"),
-    "commute": Entry("Simulate daily commuters with a map that learns.", "drivers:Commute", CROWDS),
-    "fleet": Entry("Simulate many cars that search at the same time.", "drivers:Fleet", CROWDS),
-    "curve": Entry("Fit search time and walk as functions of occupancy.", "drivers:Curve", CROWDS),
-    "survey": Entry("Drive past every slot, and map which are taken.", "survey:Survey", SENSE),
+    "commute": Entry("Simulate daily commuters with a map that learns.", "commute", CROWDS),
+    "fleet": Entry("Simulate many cars that search at the same time.", "fleet", CROWDS),
+    "curve": Entry("Fit search time and walk as functions of occupancy.", "curve", CROWDS),
+    "survey": Entry("Drive past every slot, and map which are taken.", "survey", SENSE),
     "map": Entry("Show the predictions of a map.", "survey:Map", SENSE),
     "map-drive": Entry("Make a map from a recorded drive, photographs or a film.", "survey:MapDrive", SENSE),
     "sensors": Entry("Preview the simulated sensors.", heading=SENSE),
@@ -51,8 +51,8 @@ COMMANDS = {
     "detect": Entry("Find cars in photographs, videos and recorded drives.", "detect:Detect", SENSE),
     "train-detector": Entry("Train a car model on photographs.", "detect:TrainDetector", SENSE),
     "evaluate-detector": Entry("Measure a detector on labelled images.", "detect:EvaluateDetector", SENSE),
-    "park": Entry("Evaluate agents that drive the car into a slot.", "drive:Park", DRIVE),
-    "calibrate": Entry("Measure the costs of searches on whole driven trips.", "drive:Calibrate", DRIVE),
+    "park": Entry("Evaluate agents that drive the car into a slot.", "park", DRIVE),
+    "calibrate": Entry("Measure the costs of searches on whole driven trips.", "calibrate", DRIVE),
     "lot": Entry("Show, check, import, count and convert lots.", heading=DATA),
     "lot show": Entry("Draw a lot and summarise it.", "lot:Show"),
     "lot check": Entry(
@@ -63,10 +63,12 @@ COMMANDS = {
     "lot convert": Entry("Write a lot as native GeoJSON.", "lot:Convert"),
     "occupancy": Entry("Fit models to recorded occupancy, and score forecasts.", heading=DATA),
     "occupancy fit": Entry("Fit a model to recorded occupancy by maximum likelihood.", "occupancy:Fit"),
-    "occupancy demand": Entry("Fit the demand of a town to counts of its car parks.", "occupancy:Demand"),
+    "occupancy demand": Entry("Fit the demand of a town to counts of its car parks.", "demand"),
     "occupancy evaluate": Entry("Score forecasts of occupancy against simple ones.", "occupancy:Evaluate"),
     "occupancy record": Entry("Record days of a town's own demand as a log.", "occupancy:Record"),
-    "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "schema:Schema", DATA),
+    "schema": Entry(
+        "Print the JSON schema of a kind of file, or write all schemas.", "study_command:Schema", DATA
+    ),
 }
 """Commands and groups of commands, as the help page lists them."""
 app = make_app(

@@ -3,43 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from parkenv.cli.options import Command
-from parkenv.cli.study_command import AgentStudyCommand
-from parkenv.cli.tables import command_line, make_console, make_table
+from parkenv.cli.tables import command_line, make_console, print_rows, print_table
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several
+from parkenv.show.columns import Column, shared
 from parkenv.show.plurals import plural
-from parkenv.studies.benchmark.study import RESULT, Benchmark
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from parkenv.studies.runner import Result
-
-
-class RunSuite(AgentStudyCommand):
-    """The suite defines scenarios, costs, speeds and seeds.
-
-    An agent's score in a task is the mean total time of the clairvoyant bound divided by the agent's own; its score in
-    the suite is the mean over the tasks, at most 1.
-    """
-
-    examples = """
-        parkenv benchmark run v3 --agents belief,mdp --out results/v3
-        parkenv benchmark check results/v3/result.json
-        """
-
-    study: Benchmark = Benchmark()
-    out: Path | None = option(Path("results/v3"), "Folder for result.json and the episodes.", short="-o")
-
-    def show(self, console: Console, result: Result) -> None:
-        """Print the scores of a finished suite."""
-        from parkenv.files.limited_reading import read_json
-
-        if result.complete:
-            _print(console, [read_json(result.folder / RESULT)])
+from parkenv.studies.benchmark.study import score_table
 
 
 class Check(Command):
@@ -59,7 +31,7 @@ class Check(Command):
         console = make_console()
         with console.status("Checking"):
             checked = [check_result(file) for file in self.results]
-        _print(console, checked)
+        print_table(console, score_table(checked))
         console.print(f"{'Complete and consistent' if len(checked) == 1 else 'All complete and consistent'}.")
 
 
@@ -112,40 +84,28 @@ class Show(Command):
         suite = Suite.packaged()
         console = make_console()
         console.print(f"{suite.name}: {suite.description}")
-        cells = []
+        rows = []
         for task in suite.tasks:
-            made = task.made(suite.arrival)
-            level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
-            walk = f"{made.v_walk * 3.6:g} km/h"
-            days = ", ".join(f"{size:g}" for size in task.day_error)
-            cells.append(
-                (
-                    task.name,
-                    task.scenario,
-                    str(made.lot.n_slots),
-                    level,
-                    days,
-                    task.sensor_model,
-                    walk,
-                )
+            scenario, level = task.made(suite.arrival), task.occupancy_level
+            rows.append(
+                {
+                    "task": task.name,
+                    "scenario": task.scenario,
+                    "slots": scenario.lot.n_slots,
+                    "mean_occupancy": "as it comes" if level is None else f"{level:.0%}",
+                    "day_error": ", ".join(f"{size:g}" for size in task.day_error),
+                    "sensor_model": task.sensor_model,
+                    "v_walk_kmh": scenario.v_walk * 3.6,
+                }
             )
-        headings = ["task", "scenario", "slots", "mean occupancy", "day error", "sensor model", "walking"]
-        console.print(make_table(None, headings, cells))
+        print_rows(
+            console,
+            "Tasks",
+            rows,
+            columns=(Column("task", "task"), *shared("scenario"), Column("slots", "slots")),
+        )
         counts = [len(task.seeds) for task in suite.tasks]
         console.print(
             f"{min(counts)} to {max(counts)} episodes a task, {sum(counts):,} in all, weighted by stratum; "
             f"suite {suite.fingerprint[:16]}"
         )
-
-
-def _print(console: Console, results: list[dict[str, Any]]) -> None:
-    lines = []
-    columns: list[str] = []
-    for result in results:
-        mean = {(row["agent"], row["task"]): row["total_s"] for row in result["rows"]}
-        columns = list(dict.fromkeys(column for _, column in mean))
-        for agent, score in result["scores"].items():
-            lines.append((score, agent, [f"{mean[agent, column]:.1f}" for column in columns]))
-    lines.sort(key=lambda line: -line[0])
-    cells = ((agent, *times, f"{score:.4f}") for score, agent, times in lines)
-    console.print(make_table("Mean total time, s, and the score", ["agent", *columns, "score"], cells))

@@ -43,8 +43,8 @@ def completer(names: Sequence[str] = (), suffixes: Sequence[str] = (), several: 
 
     def complete(incomplete: str) -> list[str]:
         before, comma, last = incomplete.rpartition(",") if several else ("", "", incomplete)
-        found = [name for name in names if name.startswith(last)]
-        return [f"{before}{comma}{word}" for word in (*found, *_files(last, suffixes))]
+        words = [name for name in names if name.startswith(last)]
+        return [f"{before}{comma}{word}" for word in (*words, *_files(last, suffixes))]
 
     return complete
 
@@ -100,7 +100,7 @@ class Entry(NamedTuple):
 
     Attributes:
         summary: what the command does, in a sentence.
-        source: its class, `MODULE:CLASS` below `parkenv.cli`; empty for a group of commands.
+        source: its class, `MODULE:CLASS` below `parkenv.cli`, or its kind of study; empty for a group of commands.
         heading: what it stands under.
     """
 
@@ -118,11 +118,9 @@ class _Page:
     order: Sequence[str] = ()
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the words after the command, without the braces of required arguments."""
         return [re.sub("[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]  # type: ignore[misc]
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
-        """Write the text, and the examples as they are."""
         del ctx
         formatter.write_paragraph()
         with formatter.indentation():
@@ -132,11 +130,9 @@ class _Page:
 
     @property
     def text(self) -> str:
-        """What the page says before the examples."""
         return self.help or ""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments, options and commands, each under its heading."""
         sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         commands = getattr(self, "commands", {})
         # Typer lists groups after commands.
@@ -170,10 +166,10 @@ class _CommandPage(_Page, TyperCommand):
 
     @cached_property
     def command_class(self) -> type[Command]:
-        """The class of the command."""
         from parkenv.cli.options import command_class
 
-        return command_class(self.source)
+        kind: type[Command] = command_class(self.source)
+        return kind
 
     @property
     def text(self) -> str:
@@ -181,12 +177,10 @@ class _CommandPage(_Page, TyperCommand):
 
     @property
     def examples(self) -> str:  # type: ignore[override]
-        """Command lines."""
         return self.command_class.examples
 
     @property
     def params(self) -> list[Any]:
-        """The parameters that the fields of the command's class are."""
         if self._options is None:
             self._options, self._parameters = _parameters(self.command_class)
         return self._parameters
@@ -196,7 +190,6 @@ class _CommandPage(_Page, TyperCommand):
         self._parameters = params
 
     def invoke(self, ctx: Any) -> None:
-        """Run the command."""
         assert self._options is not None
         given = {self._options[name]: value for name, value in ctx.params.items() if value not in (None, ())}
         self.command_class.of(given).run()
@@ -217,8 +210,6 @@ class _CommandPage(_Page, TyperCommand):
 
 
 class _GroupPage(_Page, TyperGroup):
-    """A group of commands."""
-
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments; without any, print the help page."""
         if args or ctx.resilient_parsing:
@@ -266,22 +257,20 @@ def _group(name: str, entry: Entry, examples: str, order: Sequence[str] = ()) ->
     )
 
 
-def _parameters(its: type[Command]) -> tuple[dict[str, str], list[Any]]:
-    """Return the options of a command's fields by parameter, and Typer's parameters."""
+def _parameters(command_class: type[Command]) -> tuple[dict[str, str], list[Any]]:
     from parkenv.cli.options import field_options
 
-    found: dict[str, FieldOption] = {}
-    for option in field_options(its):
-        found.setdefault(option.parameter, option)
+    options: dict[str, FieldOption] = {}
+    for option in field_options(command_class):
+        options.setdefault(option.parameter, option)
 
     def command(**_: Any) -> None: ...
 
-    signature = inspect.Signature([_typed(option) for option in found.values()])
-    command.__signature__ = signature  # type: ignore[attr-defined]
+    command.__signature__ = inspect.Signature([_typed(option) for option in options.values()])  # type: ignore[attr-defined]
     app = typer.Typer(add_completion=False)
     app.command()(command)
-    made = [param for param in typer.main.get_command(app).params if param.name in found]
-    return {name: option.name for name, option in found.items()}, sorted(made, key=_panel)
+    params = [param for param in typer.main.get_command(app).params if param.name in options]
+    return {name: option.name for name, option in options.items()}, sorted(params, key=_panel)
 
 
 def _typed(option: FieldOption) -> Parameter:

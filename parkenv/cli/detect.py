@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from parkenv.cli.options import Command
-from parkenv.cli.tables import make_console, make_table, print_rows, save_summary, stages
+from parkenv.cli.tables import make_console, print_rows, save_summary, stages
 from parkenv.errors import InputError
 from parkenv.files.option import option
-from parkenv.files.spec_file import DetectorName, Several
+from parkenv.files.spec_file import DetectorName, Several, require
+from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
-from parkenv.show.report.tables import Column
 from parkenv.studies.fields import Seed
 from parkenv.studies.study import counted
 
@@ -23,6 +22,15 @@ if TYPE_CHECKING:
     from parkenv.perception.car_datasets import Crops, LabelledImage
     from parkenv.perception.car_model import CarModel
     from parkenv.perception.detector import Detector
+
+
+BOX = (
+    Column("file", "file"),
+    *(Column(side, side, digits=0) for side in ("left", "top", "right", "bottom")),
+    Column("probability", "probability", digits=2),
+    Column("view", "view"),
+    Column("visible_fraction", "visible", digits=2),
+)
 
 
 class Detect(Command):
@@ -74,33 +82,27 @@ class Detect(Command):
 
         console = make_console()
         with stages(console, "frames") as progress:
-            found = find_cars(self.images, self._finder(), self.threshold, self.step, self.out, progress)
-        headings = ["file", "left", "top", "right", "bottom", "probability", "view", "visible_fraction"]
-        boxes = [b for b in found.boxes if b["frame"] is None]
-        cells = [
-            (b["file"], *(f"{b[side]:.0f}" for side in headings[1:5]), f"{b['probability']:.2f}", b["view"],
-             "" if b["visible_fraction"] is None else f"{b['visible_fraction']:.2f}")
-            for b in boxes
-        ]  # fmt: skip
-        if found.images:
-            console.print(make_table(None, [h.removesuffix("_fraction") for h in headings], cells))
-            console.print(f"{plural(len(cells), 'car')} in {plural(found.images, 'image')}")
-        for video in found.videos:
+            cars = find_cars(self.images, self._finder(), self.threshold, self.step, self.out, progress)
+        boxes = [box for box in cars.boxes if box["frame"] is None]
+        if cars.images:
+            print_rows(console, "Cars", boxes, [column.key for column in BOX], BOX)
+            console.print(f"{plural(len(boxes), 'car')} in {plural(cars.images, 'image')}")
+        for video in cars.videos:
             console.print(
                 f"{video['file']}: {plural(video['frames'], 'frame')} of {video['seconds']:.1f} s, "
                 f"{plural(video['boxes'], 'box', 'boxes')}, at most {plural(video['most_cars'], 'car')} in a frame"
             )
         if self.out is not None:
+            file, *sides, probability, view, visible = (column.key for column in BOX)
             rows = [
-                {"file": b["file"], "box": [b[side] for side in headings[1:5]]}
-                | {k: b[k] for k in headings[5:]}
-                for b in boxes
+                {file: box[file], "box": [box[side] for side in sides]}
+                | {key: box[key] for key in (probability, view, visible)}
+                for box in boxes
             ]
-            save_summary(self.out, None, rows, videos=found.videos)
+            save_summary(self.out, None, rows, videos=cars.videos)
             console.print(f"Pictures, films, boxes.csv and summary.json are in {self.out}")
 
     def _finder(self) -> Detector:
-        """Return the detector that the options describe."""
         from parkenv.perception.detector_registry import make_detector
         from parkenv.perception.hog_detector import HogDetector
 
@@ -166,12 +168,9 @@ class TrainDetector(Command):
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        if sum(source is not None for source in (self.uiuc, self.crops, self.labels)) != 1:
-            raise PydanticCustomError(
-                "whole", "give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER"
-            )
-        if self.labels is None and (self.images is not None or self.classes is not None):
-            raise PydanticCustomError("whole", "--images and --classes go with --labels")
+        sources = sum(source is not None for source in (self.uiuc, self.crops, self.labels))
+        require(sources == 1, "give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER")
+        require(self.labels or not (self.images or self.classes), "--images and --classes go with --labels")
         return self
 
     def run(self) -> None:
@@ -208,7 +207,6 @@ class TrainDetector(Command):
         console.print(f"Trained on {model.trained_on}. Written: {self.out}")
 
     def _photographs(self) -> tuple[Crops, Sequence[LabelledImage]]:
-        """Return crops, and the photographs of labels."""
         from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
         from parkenv.perception.labelled_folders import crops_of, read_labels
 
@@ -257,8 +255,7 @@ class EvaluateDetector(Command):
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        if (self.uiuc is None) == (self.crops is None):
-            raise PydanticCustomError("whole", "give one of --uiuc FOLDER and --crops FOLDER")
+        require((self.uiuc is None) != (self.crops is None), "give one of --uiuc FOLDER and --crops FOLDER")
         return self
 
     def run(self) -> None:
@@ -274,19 +271,25 @@ class EvaluateDetector(Command):
             with stages(console, "crops") as progress:
                 advance = counted(progress, "Detecting", len(crops.positives) + len(crops.negatives))
                 rows = recall_on_crops(detector, crops, on_image=advance)
-            columns = {
-                key: Column(key, key.replace("_", " "), share=True) for key in ("false_positives", "recall")
-            }
+            columns = [
+                Column(key, key.replace("_", " "), share=True) for key in ("false_positives", "recall")
+            ]
             shown = [
                 r | {"recall_ci95": [r["recall"] - r["interval"], r["recall"] + r["interval"]]} for r in rows
             ]
-            print_rows(console, "Cars found in crops", shown, (*columns, "cars", "others"), columns)
+            print_rows(
+                console,
+                "Cars found in crops",
+                shown,
+                ("false_positives", "recall", "cars", "others"),
+                columns,
+            )
         elif self.uiuc is not None:
             make_folder(self.out)
             with stages(console, "images") as progress:
                 scores = score_on_uiuc(detector, self.uiuc, on_image=counted(progress, "Detecting"))
             rows = [score.row for score in scores]
-            print_rows(console, "UIUC", rows, rows[0])
+            print_rows(console, "UIUC", rows)
             save_curves(scores, self.detector or self.model, self.out / "recall_precision.png")
         save_summary(self.out, None, rows)
         console.print(f"Written: {self.out / 'summary.json'}")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 from typer import Exit
 
 from parkenv.cli.options import Command
@@ -18,28 +17,30 @@ from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.files.option import Option, numbers_in, option
-from parkenv.files.spec_file import Several
+from parkenv.files.spec_file import Several, require
+from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
-from parkenv.show.report.tables import Column
 from parkenv.world.tariff import NO_ZONE
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from parkenv.lots.draft import ImportOptions, Provenance
     from parkenv.world.lot import ParkingLot
 
-CENSUS = (
-    "lot", "slots", "kind", "perpendicular", "oblique", "kerbside", "extent_x_m", "extent_y_m",
-    "error_probability", "result", "reason",
-)  # fmt: skip
-"""Columns of a census that are printed."""
-_LOT_COLUMNS = {
-    column.key: column
-    for column in (
-        Column("error_probability", "p(error)", digits=2),
-        Column("extent_x_m", "east", "m", 0),
-        Column("extent_y_m", "north", "m", 0),
-    )
-}
+_LOT_COLUMNS = (
+    Column("lot", "lot"),
+    Column("slots", "slots", digits=0),
+    Column("kind", "kind"),
+    Column("perpendicular", "perpendicular"),
+    Column("oblique", "oblique"),
+    Column("kerbside", "kerbside"),
+    Column("extent_x_m", "east", "m", 0),
+    Column("extent_y_m", "north", "m", 0),
+    Column("error_probability", "p(error)", digits=2),
+    Column("result", "result"),
+    Column("reason", "reason"),
+)
 AUTO = "auto"
 """Value of `--entry` and `--goal` that allows a guess."""
 LotName = Annotated[
@@ -75,15 +76,13 @@ class Show(Command):
         from parkenv.lots import load_lot
         from parkenv.show.figures.lot import save_lot_picture
 
-        its_lot = load_lot(self.lot)
-        picture = self.out or Path(file_name(its_lot.name, ".png"))
-        origin = _provenance(Path(self.lot))
+        lot, origin = load_lot(self.lot), _provenance(Path(self.lot))
+        picture = self.out or Path(file_name(lot.name, ".png"))
         guesses = origin.guesses if origin is not None else ()
-        save_lot_picture(its_lot, picture, show_graph=self.graph, guesses=guesses)
+        save_lot_picture(lot, picture, show_graph=self.graph, guesses=guesses)
         console = make_console(soft_wrap=True)
-        for guess in guesses:
-            console.print(f"guessed: {guess}", style="cyan", markup=False)
-        console.print(f"{_summary(its_lot)}. Picture: {picture}")
+        _print_each(console, "guessed", guesses, "cyan")
+        console.print(f"{_summary(lot)}. Picture: {picture}")
 
 
 class Check(Command):
@@ -109,42 +108,29 @@ class Check(Command):
         from parkenv.studies.lots.drivability import check_drivability
 
         console = make_console(soft_wrap=True)
-        problems = check_lot(self.place)
-        form = lot_format(self.place)
-        drivability = None
+        problems, form, drivability = check_lot(self.place), lot_format(self.place), None
         if form is not None and form.is_complete and not any(p.severity == "error" for p in problems):
             origin = _provenance(self.place)
             with warnings.catch_warnings(action="ignore"):  # listed already
                 lot = read_lot(self.place)
-            drivability = check_drivability(
-                lot, origin.issues if origin is not None else (), drive=self.drive
-            )
+            issues = origin.issues if origin is not None else ()
+            drivability = check_drivability(lot, issues, drive=self.drive)
             problems += drivability.problems
         for problem in problems:
             feature = "" if problem.feature is None else f"feature {problem.feature}: "
-            console.print(
-                f"{problem.severity}: {feature}{problem.message}",
-                style="red" if problem.severity == "error" else "yellow",
-                markup=False,
-            )
+            style = "red" if problem.severity == "error" else "yellow"
+            _print_each(console, problem.severity, [f"{feature}{problem.message}"], style)
         errors = sum(p.severity == "error" for p in problems)
-        if not problems:
-            console.print(f"{self.place}: no errors, no warnings")
-        else:
-            counts = (errors, "error"), (len(problems) - errors, "warning")
-            console.print(f"{self.place}: " + ", ".join(plural(n, word) for n, word in counts))
+        counts = f"{plural(errors, 'error')}, {plural(len(problems) - errors, 'warning')}"
+        console.print(f"{self.place}: {counts if problems else 'no errors, no warnings'}")
         if errors:
             raise Exit(2)
         if drivability is not None:
             console.print(_summary(lot))
             if self.drive:
                 console.print(f"{drivability.planned} of {drivability.kinds} kinds of manoeuvres planned")
-            reasons = "; ".join(map(str, drivability.issues))
-            console.print(
-                f"error probability {drivability.error_probability:.2f}"
-                + (f": {reasons}" if reasons else ""),
-                markup=False,
-            )
+            reasons = f": {'; '.join(map(str, drivability.issues))}" if drivability.issues else ""
+            console.print(f"error probability {drivability.error_probability:.2f}{reasons}")
 
 
 def _points(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
@@ -241,35 +227,27 @@ class Import(Command):
     )
 
     @model_validator(mode="after")
-    def _split_alone(self) -> Self:
+    def _consistent(self) -> Self:
         points = [point for point in (*self.goal, *self.entry) if point != AUTO]
-        if self.split and self.town:
-            raise PydanticCustomError("whole", "--split and --town: want one of them")
-        if self.around is not None and self.bounds is not None:
-            raise PydanticCustomError("whole", "--bounds and --around: want one of them")
-        if self.split and (points or self.box or self.picture or self.left_hand):
-            raise PydanticCustomError(
-                "whole",
-                "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --around, "
-                "--picture, --left-hand",
-            )
-        if (self.car_parks is not None and not self.town) or (self.listed_only and self.car_parks is None):
-            raise PydanticCustomError("whole", "--car-parks wants --town, --listed-only wants --car-parks")
-        if self.town and (self.entry or self.goal or self.disabled):
-            raise PydanticCustomError(
-                "whole", "--town has those of the map, want no --entry, --goal, --disabled"
-            )
-        if (
-            self.town
-            and self.box
-            and not all(abs(lat) <= 90.0 and abs(lon) <= 180.0 for lat, lon in self.box)
-        ):
-            raise PydanticCustomError("whole", "--bounds: want SOUTH,WEST,NORTH,EAST with --town")
+        on_earth = all(abs(lat) <= 90.0 and abs(lon) <= 180.0 for lat, lon in self.box or ())
+        require(not (self.split and self.town), "--split and --town: want one of them")
+        require(self.around is None or self.bounds is None, "--bounds and --around: want one of them")
+        require(
+            not (self.split and (points or self.box or self.picture or self.left_hand)),
+            "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --around, --picture, "
+            "--left-hand",
+        )
+        require(self.town or self.car_parks is None, "--car-parks wants --town")
+        require(self.car_parks or not self.listed_only, "--listed-only wants --car-parks")
+        require(
+            not (self.town and (self.entry or self.goal or self.disabled)),
+            "--town has those of the map, want no --entry, --goal, --disabled",
+        )
+        require(on_earth or not self.town, "--bounds: want SOUTH,WEST,NORTH,EAST with --town")
         return self
 
     @property
     def box(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """Two corners of what is imported; None for all of the map."""
         if self.around is not None:
             from parkenv.lots.local_frame import LocalFrame
 
@@ -309,15 +287,13 @@ class Import(Command):
         from parkenv.lots.town.supply import TABLE
 
         check_lot_output(self.out)
-        table = self.out.with_suffix(".csv")
-        if self.town:
-            check_writable(table)
-        if self.picture is not None:
-            if self.picture.suffix.lower() != ".png":
-                raise InputError(f"--picture {self.picture}: want a name that ends in .png")
-            check_writable(self.picture)
+        table, town = self.out.with_suffix(".csv"), None
+        if self.picture is not None and self.picture.suffix.lower() != ".png":
+            raise InputError(f"--picture {self.picture}: want a name that ends in .png")
+        for file in (table if self.town else None, self.picture):
+            if file is not None:
+                check_writable(file)
         console = make_console(soft_wrap=True)
-        town = None
         if self.town:
             town = import_town(
                 self.place, self.car_parks, listed_only=self.listed_only, bounds=self.box,
@@ -327,10 +303,8 @@ class Import(Command):
         draft = draft.in_left_hand_traffic() if self.left_hand else draft
         for line in draft.found:
             console.print(line)
-        for guess in draft.guesses:
-            console.print(f"guessed: {guess}", style="cyan", markup=False)
-        for left in draft.left_out:
-            console.print(f"left out: {left}", style="yellow")
+        _print_each(console, "guessed", draft.guesses, "cyan")
+        _print_each(console, "left out", draft.left_out, "yellow")
         if self.picture is not None:
             from parkenv.show.figures.lot_import import save_import_picture
             from parkenv.show.figures.town_import import save_town_picture
@@ -345,16 +319,14 @@ class Import(Command):
         except InputError as error:
             raise InputError(f"{self.place}: {error}") from error
         caution = "" if town is None else town.caution
-        provenance = None
-        if draft.guesses:
-            provenance = Provenance(self.place.name, draft.guesses, draft.issues, caution)
-        write_lot(lot, self.out, provenance)
+        provenance = Provenance(self.place.name, draft.guesses, draft.issues, caution)
+        write_lot(lot, self.out, provenance if draft.guesses else None)
         if town is not None:
             write_csv(table, TABLE, town.facilities)
             console.print(f"Facilities: {table}")
         console.print(f"Wrote {self.out}. {_summary(lot)}")
         if caution:
-            console.print(caution, style="yellow", markup=False)
+            console.print(caution, style="yellow")
 
     def _import_car_parks(self) -> None:
         from parkenv.files.atomic_write import write_together
@@ -364,15 +336,12 @@ class Import(Command):
         with stages(console) as progress, write_together(self.out) as folder:
             town = import_town_lots(self.place, folder, self._options, self.least, progress)
             save_summary(folder, None, town.rows)
-        print_rows(make_console(), "Car parks", town.rows, town.rows[0], _LOT_COLUMNS)
+        print_rows(make_console(), "Car parks", town.rows, columns=_LOT_COLUMNS)
         results = Counter(row["result"] for row in town.rows)
         listed = ", ".join(f"{results[name]} {name}" for name in ("clean", "warnings", "refused"))
         lots = plural(len(town.rows) - results["refused"], "lot")
-        pictures = (
-            f" Pictures: {', '.join(str(self.out / p.name) for p in town.pictures)}" if town.pictures else ""
-        )
         console.print(
-            f"{plural(len(town.rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}.{pictures}"
+            f"{plural(len(town.rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}"
         )
 
 
@@ -408,12 +377,11 @@ class Census(Command):
         with stages(make_console(soft_wrap=True), "lots") as progress:
             rows = take_census(self.places, self.out, drive=self.drive, progress=progress)
         save_summary(self.out, None, rows)
-        print_rows(make_console(), "Lots", rows, CENSUS, _LOT_COLUMNS)
-        results = Counter(row["result"] for row in rows)
+        print_rows(make_console(), "Lots", rows, [column.key for column in _LOT_COLUMNS], _LOT_COLUMNS)
+        results, slots = Counter(row["result"] for row in rows), sum(row.get("slots", 0) for row in rows)
         listed = ", ".join(
             f"{results[name]} {name}" for name in ("clean", "warnings", "invalid") if results[name]
         )
-        slots = sum(row.get("slots", 0) for row in rows)
         make_console(soft_wrap=True).print(
             f"{plural(len(rows), 'lot')}, {slots:,} slots: {listed}. Table and pictures are in {self.out}"
         )
@@ -434,6 +402,11 @@ class Convert(Command):
 
         write_lot(load_lot(self.lot), self.out)
         make_console().print(f"Wrote {self.out}")
+
+
+def _print_each(console: Console, what: str, texts: Iterable[object], style: str) -> None:
+    for text in texts:
+        console.print(f"{what}: {text}", style=style)
 
 
 def _provenance(path: Path) -> Provenance | None:

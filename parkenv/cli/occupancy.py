@@ -2,50 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
 from parkenv.cli.options import Command
-from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_console, print_rows, save_summary, stages
+from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import Date, scenario_spec
+from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
-from parkenv.show.report.tables import OF_FLEETS, Column
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
-from parkenv.studies.fleet.demand_study import PREDICTIONS, DemandStudy
-from parkenv.studies.results import Row, without_nan
+from parkenv.studies.fleet.columns import COLUMNS
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.runner import Result
+    from parkenv.studies.occupancy import FitReport
 
-FAR_OFF = 0.15
-"""Mean difference from the counts, share of the places, above which a car park is said not to be followed."""
 SCORE_COLUMNS = (
+    Column("model", "model"),
     Column("log_loss", "log-loss", digits=4),
     Column("brier", "Brier", digits=4),
     Column("crps", "CRPS", digits=4),
     Column("coverage_90", "days within their 90 % interval", share=True),
     Column("coverage_90_hours", "hours within theirs", share=True),
     Column("difference", "log-loss more than ours", digits=4, signed=True),
-)
-SCORES = ("model", *(column.key for column in SCORE_COLUMNS))
-DEMAND_COLUMNS = (
-    Column("car_park", "car park"),
-    Column("capacity", "places", digits=0),
-    Column("arrivals_a_day", "cars a day", digits=0),
-    Column("stay_h", "stay", "h"),
-    Column("days_held_out", "days", digits=0),
-    Column("counted", "counted", share=True, digits=0),
-    Column("simulated", "simulated", share=True, digits=0),
-    Column("fit_error", "error, fit", share=True),
-    *(Column(f"{name}_error", f"error, {name.replace('_', ' ')}", share=True) for name in PREDICTIONS),
 )
 LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
 TimeZone = Annotated[str, Option(takes="NAME")]
@@ -84,27 +71,19 @@ class Fit(Command):
     )
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
-        from parkenv.forecast.counts import Counts, is_counts
-        from parkenv.studies.occupancy import fit_counts, fit_log
+        from parkenv.studies.occupancy import fit
 
-        make_folder(self.out)
         console = make_console()
-        if is_counts(self.log):
-            with stages(console) as progress:
-                title, summary = fit_counts(Counts.read(self.log, self.timezone), progress)
-            print_rows(console, title, summary["rows"], summary["rows"][0])
-            _print_notes(console, summary)
-            drift = summary["level_drift_per_week"]
-            console.print(f"Levels drift by {drift:.2f} logits a week. The summary is in {self.out}")
-        else:
-            with console.status("Fitting rates"):
-                title, summary = fit_log(self.log, self.out, max_gap_s=3600.0 * self.max_gap_h)
-            print_rows(console, title, summary["rows"], summary["rows"][0], OF_FLEETS)
-            level = summary["day_error"]["level"]
-            console.print(f"Days differ from the process by a standard deviation of {level:.2f} logits")
-            console.print(f"Process, picture and summary are in {self.out}")
-        save_summary(self.out, None, **summary)
+        with stages(console) as progress:
+            make_folder(self.out)
+            report = fit(
+                self.log,
+                self.out,
+                max_gap_s=3600.0 * self.max_gap_h,
+                timezone=self.timezone,
+                progress=progress,
+            )
+        _show(console, report, self.out, None, COLUMNS)
 
 
 class Evaluate(Command):
@@ -136,70 +115,21 @@ class Evaluate(Command):
     )
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
-        from parkenv.forecast.counts import Counts, is_counts
-        from parkenv.studies.occupancy import evaluate_counts, evaluate_log
+        from parkenv.studies.occupancy import evaluate
 
-        make_folder(self.out)
         console = make_console()
         with stages(console) as progress:
-            if of_counts := is_counts(self.log):
-                counts = Counts.read(self.log, self.timezone)
-                if self.car_parks is not None:
-                    counts = counts.chosen(list(self.car_parks))
-                title, summary = evaluate_counts(
-                    counts, self.out, from_day=self.from_day, seed=self.seed, progress=progress
-                )
-            else:
-                title, summary = evaluate_log(
-                    self.log, self.out, from_day=self.from_day, seed=self.seed, progress=progress
-                )
-        print_rows(console, title, summary["rows"], SCORES, {column.key: column for column in SCORE_COLUMNS})
-        if of_counts:
-            _print_notes(console, summary)
-        save_summary(self.out, self.seed, **summary)
-        console.print(f"Pictures and summary are in {self.out}")
-
-
-class Demand(StudyCommand):
-    """The fitted demand of a town reproduces the counted occupancy of its car parks.
-
-    Each car park gets a purpose with the same name: arrivals by hour (least squares), and cars that are parked at the
-    start. Drivers choose freely, so the command simulates the town and corrects the excess or deficit of each car park,
-    --rounds times. Counts do not show how often cars change; of several mean stays, the longest that can follow the
-    counts is used.
-
-    The result, scenario.json, is the scenario with this demand for weekdays; Saturdays and Sundays have separate files.
-    Each held-out day is simulated with its own demand, which follows the forecast from earlier counts.
-    """
-
-    examples = """
-        parkenv occupancy demand counts.csv.gz --scenario town.toml --from 2021-09-06
-        parkenv fleet --scenario results/demand/scenario.json
-        """
-
-    study: DemandStudy = DemandStudy()
-    out: Path = option(
-        Path("results/demand"),
-        "Folder for scenario.json, saturday.json, sunday.json, summary.json, predicted.csv, "
-        "demand.png, and finished work: fitted.jsonl and days.jsonl.",
-        short="-o",
-    )
-
-    def show(self, console: Console, result: Result) -> None:
-        """Print how far the town, and simpler predictions, are from the counts of the days held out that are done."""
-        if not result.rows:
-            return
-        summary = result.summary
-        what = f"{plural(len(result.rows), 'car park')}, {plural(summary['days_held_out'], 'day')} held out"
-        rows = without_nan([*result.rows, {**summary, "car_park": "all"}])
-        columns = {column.key: column for column in DEMAND_COLUMNS}
-        print_rows(console, f"{self.study.scenario.title}: {what}", rows, columns, columns)
-        off = [row["car_park"] for row in result.rows if row["simulated_error"] > FAR_OFF]
-        if off:
-            console.print(f"warning: not followed: {', '.join(off)}", style="yellow", soft_wrap=True)
-        if summary["not_in_lot"]:
-            console.print(f"Not in the lot: {', '.join(summary['not_in_lot'])}", soft_wrap=True)
+            make_folder(self.out)
+            report = evaluate(
+                self.log,
+                self.out,
+                from_day=self.from_day,
+                car_parks=self.car_parks,
+                timezone=self.timezone,
+                seed=self.seed,
+                progress=progress,
+            )
+        _show(console, report, self.out, self.seed, SCORE_COLUMNS, [column.key for column in SCORE_COLUMNS])
 
 
 class Record(Command):
@@ -239,9 +169,16 @@ class Record(Command):
         console.print(f"{self.out}: {lines:,} observations of {plural(self.days, 'day')}", soft_wrap=True)
 
 
-def _print_notes(console: Console, summary: Row) -> None:
-    """Print what was wrong with the counts."""
-    faults = ", ".join(f"{name.replace('_', ' ')} {n:,}" for name, n in summary["faults"].items() if n)
-    console.print(f"Faults: {faults or 'none'}", soft_wrap=True)
-    for name, what in summary["idle"].items():
-        console.print(f"{name}: {what}", soft_wrap=True)
+def _show(
+    console: Console,
+    report: FitReport,
+    out: Path,
+    seed: int | None,
+    columns: Sequence[Column],
+    keys: Sequence[str] = (),
+) -> None:
+    print_rows(console, report.title, report.summary["rows"], keys, columns)
+    for note in report.notes:
+        console.print(note, soft_wrap=True)
+    save_summary(out, seed, **report.summary)
+    console.print(f"Summary and pictures are in {out}")

@@ -7,6 +7,7 @@ import types
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from keyword import iskeyword
 from pathlib import Path
@@ -16,10 +17,8 @@ import annotated_types
 from pydantic.fields import FieldInfo
 
 from parkenv.errors import InputError
-from parkenv.files.file_names import file_name
-from parkenv.files.option import Inside, Option, words_in
+from parkenv.files.option import Inside, Option
 from parkenv.files.spec_file import Spec, models_in
-from parkenv.scenarios.spec import ScenarioSpec
 
 SpecT = TypeVar("SpecT", bound=Spec)
 _SHOWN_BOUND = 1_000  # larger bounds only guard against mistakes
@@ -41,19 +40,19 @@ class Command(Spec):
 
     @classmethod
     def of(cls, given: Given) -> Self:
-        """Make the command from what was given."""
-        return made(cls, given)
+        return spec_of(cls, given)
 
     @abstractmethod
     def run(self) -> None:
         """Run it, and print what it found."""
 
 
-def command_class(source: str) -> type[Command]:
-    """Import the class of a command, `MODULE:CLASS` below `parkenv.cli`."""
+def command_class(source: str) -> Any:
+    """Return the class of a command: `MODULE:CLASS` below `parkenv.cli`, or a kind of study."""
     module, _, name = source.partition(":")
-    found: type[Command] = getattr(import_module(f"parkenv.cli.{module}"), name)
-    return found
+    if name:
+        return getattr(import_module(f"parkenv.cli.{module}"), name)
+    return import_module("parkenv.cli.study_command").study_command(source)
 
 
 @dataclass(frozen=True)
@@ -80,19 +79,16 @@ class FieldOption:
 
     @property
     def parameter(self) -> str:
-        """Its name among the parameters of a command."""
         name = self.name.lstrip("-").replace("-", "_").lower()
         # An argument and an option of the same name set the same field.
         return f"{name}_" if iskeyword(name) or self.option.argument else name
 
     @property
     def is_required(self) -> bool:
-        """Whether the command needs it."""
         return len(self.path) == 1 and self.field.is_required()
 
     @property
     def is_switch(self) -> bool:
-        """Whether the option takes no value."""
         return self.field.annotation is bool
 
     @property
@@ -102,29 +98,28 @@ class FieldOption:
 
     @property
     def is_repeated(self) -> bool:
-        """Whether it may be given several times."""
         is_list = get_origin(_bare(self.field.annotation)) is tuple
         return self.option.repeat or (self.option.argument and is_list)
 
     @property
+    def kind(self) -> Any:
+        """The type of a value."""
+        kind = _bare(self.field.annotation)
+        return get_args(kind)[0] if self.is_repeated else kind
+
+    @property
     def takes(self) -> str:
         """What the option takes: choices, or a letter with the field's bounds."""
-        takes = self.option.takes or ("DIR" if self.name == "--out" else "")
-        takes = takes or (self.name if self.option.argument else "")
-        if len(takes) > 2:
-            return takes
-        kind = get_args(_bare(self.field.annotation))[0] if self.is_repeated else self.field.annotation
-        return _taken(kind, self.field.metadata, takes)
+        default = "DIR" if self.name == "--out" else self.name if self.option.argument else ""
+        takes = self.option.takes or default
+        return takes if len(takes) > 2 else _taken(self.kind, self.field.metadata, takes)
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """The words that the option takes, if these are all."""
-        kind = _bare(self.field.annotation)
-        return get_args(kind) if get_origin(kind) is Literal else ()
+        return get_args(self.kind) if get_origin(self.kind) is Literal else ()
 
     @property
     def help(self) -> str:
-        """The description with the default."""
         default = self.option.default or self._default()
         text = self.option.description or self.field.description or ""
         return f"{text}  [default: {default}]" if default else text
@@ -138,21 +133,14 @@ class FieldOption:
         return ",".join(_shown(part) for part in (value if isinstance(value, tuple) else (value,)))
 
     def value(self, given: Any) -> object:
-        """Convert what was given."""
         if self.is_switch:
             return given
+        convert = self.option.parse or partial(_converted, self.kind)
         try:
-            if self.is_repeated:
-                kind = get_args(_bare(self.field.annotation))[0]
-                return tuple(
-                    self.option.parse(t) if self.option.parse else _converted(kind, t) for t in given
-                )
-            return self.option.parse(given) if self.option.parse else _converted(self.field.annotation, given)
+            return tuple(map(convert, given)) if self.is_repeated else convert(given)
         except InputError as error:
-            message = str(error)
-            raise InputError(
-                f"{self.name} {message}" if message.startswith(("is ", "names ")) else message
-            ) from None
+            begun = f"{self.name} " if str(error).startswith(("is ", "names ")) else ""
+            raise InputError(f"{begun}{error}") from None
 
 
 _Values = dict[tuple[str, ...], tuple[FieldOption, object]]  # of options and what they are set to, by path
@@ -183,7 +171,7 @@ def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[Fie
                         yield option
 
 
-def made(model: type[SpecT], given: Given, base: SpecT | None = None) -> SpecT:
+def spec_of(model: type[SpecT], given: Given, base: SpecT | None = None) -> SpecT:
     """Return a specification as options make it.
 
     An option of a table in a list, such as that of scenarios, changes every table of the list; options that set whole
@@ -200,10 +188,10 @@ def made(model: type[SpecT], given: Given, base: SpecT | None = None) -> SpecT:
             other = chosen.setdefault(option.path, option)
             if other.name != option.name:
                 raise InputError(f"{other.name} and {option.name} exclude each other")
-    return _made(model, base, {path: (o, o.value(given[o.name])) for path, o in chosen.items()})
+    return _with_values(model, base, {path: (o, o.value(given[o.name])) for path, o in chosen.items()})
 
 
-def _made(model: type[SpecT], base: SpecT | None, values: _Values) -> SpecT:
+def _with_values(model: type[SpecT], base: SpecT | None, values: _Values) -> SpecT:
     own = {path[0]: (option, value) for path, (option, value) in values.items() if len(path) == 1}
     sets = {name: value for option, _ in own.values() for name, value in option.option.sets.items()}
     names = {name: option.name for name, (option, _) in own.items()}
@@ -221,38 +209,11 @@ def _made(model: type[SpecT], base: SpecT | None, values: _Values) -> SpecT:
             table = () if get_origin(_bare(annotation)) is tuple else next(models_in(annotation))()
         several = isinstance(table, tuple)
         tables = table if several else (table,)
-        if _CAR_PARK in inner:
-            tables = tuple(one for scenario in tables for one in _by_car_park(scenario, inner))
-            if not several and len(tables) > 1:
-                raise InputError(f"--car-park names {len(tables)} scenarios, want one")
-            inner = {path: value for path, value in inner.items() if path not in _COUNTS}
-        tables = tuple(_made(type(one), one, inner) for one in tables)
-        options = ", ".join(option.name for option, _ in inner.values()) or "--car-park"
+        tables = tuple(_with_values(type(table), table, inner) for table in tables)
+        options = ", ".join(option.name for option, _ in inner.values())
         if tables:
             spec = spec.changed(options, **{name: tables if several else tables[0]})
     return spec
-
-
-_CAR_PARK = ("occupancy", "counts", "car_park")
-_COUNTS = (_CAR_PARK, ("occupancy",), ("occupancy", "replay_from"))
-
-
-def _by_car_park(scenario: ScenarioSpec, values: _Values) -> list[ScenarioSpec]:
-    """Return a scenario for each of the car parks of a file of counts."""
-    if not all(path in values for path in _COUNTS):
-        raise InputError("--car-park requires --occupancy FILE.csv and --replay-from DATE")
-    from parkenv.scenarios.build import car_parks
-
-    names, file, replay_from = (str(values[path][1]) for path in _COUNTS)
-    return [
-        scenario.changed(
-            "--car-park",
-            name=file_name(f"{scenario.title} {name}").replace(",", " ")[:80],
-            occupancy={"counts": {"file": file, "car_park": name}, "replay_from": replay_from},
-            forecast="own",
-        )
-        for name in (car_parks(Path(file)) if names == "all" else words_in(names))
-    ]
 
 
 def _bare(annotation: Any) -> Any:
@@ -285,12 +246,11 @@ def _converted(annotation: Any, text: str) -> object:
     return text
 
 
-def _taken(annotation: Any, metadata: Collection[Any], letter: str = "") -> str:
-    kind = _bare(annotation)
+def _taken(kind: Any, metadata: Collection[Any], letter: str = "") -> str:
     if get_origin(kind) is Literal:
         return "|".join(get_args(kind))
     if get_origin(kind) is tuple:
-        return f"{_taken(get_args(kind)[0], (), letter)}[,...]"
+        return f"{_taken(_bare(get_args(kind)[0]), (), letter)}[,...]"
     letter = letter or _LETTERS.get(kind, "TEXT")
     low = high = ""
     for bound in metadata:

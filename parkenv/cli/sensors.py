@@ -14,7 +14,7 @@ from parkenv.files.known_names import WEATHERS, RigName, WeatherName
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.report.tables import Column
+from parkenv.show.columns import Column
 from parkenv.studies.fields import PRICES, TRAFFIC, Detector, OneScenario, Scenarios, Seed, with_traffic
 from parkenv.studies.study import ExecutionSpec, counted
 
@@ -120,5 +120,5 @@ class FitSensorModel(Command, ExecutionSpec):
         model.to_file(self.out)
         in_range = counts.counts.reshape(-1, 2, 3).sum(axis=(1, 2)).tolist()
         rows = [{**asdict(band), "slots_in_range": n} for band, n in zip(model.bands, in_range, strict=True)]
-        print_rows(console, f"Observations of slots, rig {rig}", rows, rows[0], {"up_to": UP_TO})
+        print_rows(console, f"Observations of slots, rig {rig}", rows, columns=(UP_TO,))
         console.print(f"Written: {self.out}")

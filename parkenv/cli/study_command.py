@@ -1,31 +1,45 @@
-"""Commands that run a study into a folder, with progress bars, and print its result; `parkenv run`."""
+"""Commands that run a study into a folder, and print its result; `parkenv run` and `schema`."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
+import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
-from parkenv.cli.options import Command, Given, command_class, field_options, made
+from pydantic import create_model
+from typer import echo
+
+from parkenv.cli.options import Command, Given, command_class, field_options, spec_of
 from parkenv.cli.report import make_report
-from parkenv.cli.tables import command_line, make_console, stages
+from parkenv.cli.tables import command_line, make_console, print_table, stages
 from parkenv.cli.trust import Trust, TrustModel, readable_models, require_trust
-from parkenv.errors import InputError
+from parkenv.errors import InputError, nearest
 from parkenv.files.option import Option, option
 from parkenv.studies.agent_spec import split_agents
-from parkenv.studies.results import SPEC_FILE
-from parkenv.studies.study import ExecutionSpec, Study, read_study
+from parkenv.studies.results import SPEC_FILE, without_nan
+from parkenv.studies.study import STUDIES, ExecutionSpec, Study, read_study, schemas, study_class
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from parkenv.studies.runner import Result
 
+WITH_MORE = {
+    "compare": "compare:Compare",
+    "survey": "survey:Survey",
+    "demo": "demo:Demo",
+    "park": "drive:Park",
+}
+"""Commands of studies that have options besides the fields of the study."""
+
+KINDS = ("scenario", *STUDIES)
+"""Kinds of files that have a schema."""
+
 
 class RunCommand(Command):
     """A command that runs a study into a folder."""
 
-    out: Annotated[Path | None, Option(short="-o")]
+    out: Annotated[Path | None, Option(short="-o")] = None
     resume: bool = option(
         False,
         "Continue the run in --out. Options may change it, for example to more episodes, if "
@@ -38,28 +52,34 @@ class RunCommand(Command):
 
 
 class StudyCommand(RunCommand):
-    """A command that runs one kind of study."""
+    """A command that runs one kind of study; see `study_command`."""
 
     study: Study
 
     @classmethod
     def of(cls, given: Given) -> Self:
         """See `Command`: options change the study, which with --resume is the one in the folder."""
+        if "--agents" in given and "--trust-model" in given:
+            given = {**given, "--agents": ",".join(readable_models(split_agents(given["--agents"])))}
         options = [option for option in field_options(cls) if option.name in given]
-        command = made(cls, {option.name: given[option.name] for option in options if len(option.path) == 1})
-        study, file = command.study, (command.out or Path()) / SPEC_FILE
+        command = spec_of(
+            cls, {option.name: given[option.name] for option in options if len(option.path) == 1}
+        )
+        study, out = command.study, command.out or command.study.folder(given)
+        file = out / SPEC_FILE
         if command.resume:
             if not file.exists():
-                raise InputError(f"--resume: {command.out} holds no run to resume: no {SPEC_FILE}")
+                raise InputError(f"--resume: {out} holds no run to resume: no {SPEC_FILE}")
             study = type(study).read(file)
         if "--backend" in given and "--address" not in given:
             # The address belongs to the other backend.
             study = study.changed(address=None)
-        inner = {option.name: option.path[1] for option in options if len(option.path) > 1}
+        inner = {option.name: given[option.name] for option in options if len(option.path) > 1}
         # An option of a table in the field, such as --hours of the scenarios, leaves the rest as the file has it.
         whole = {option.path[1] for option in options if len(option.path) == 2}
-        require_trust(study, file.parent, command.trust or not command.resume, given=whole)
-        return made(cls, {name: given[name] for name in inner}, command.changed(study=study))
+        require_trust(study, out, command.trust or not command.resume, given=whole)
+        command = spec_of(cls, inner, command.changed(study=study, out=out))
+        return command.changed(study=command.study.with_options(given, resumed=command.resume))
 
     def run(self) -> None:
         self.run_study()
@@ -73,62 +93,48 @@ class StudyCommand(RunCommand):
         """
         from parkenv.studies.runner import Interrupted, run
 
-        console = make_console()
+        console, out = make_console(), self.out or self.study.folder({})
         try:
             with stages(console, self.study.unit) as progress:
                 result = run(
-                    self.study, self.out, resume=self.resume, overwrite=self.overwrite, progress=progress,
+                    self.study, out, resume=self.resume, overwrite=self.overwrite, progress=progress,
                     command=command_line(),
                 )  # fmt: skip
         except KeyboardInterrupt as stopped:
             if isinstance(stopped, Interrupted):
                 self.show(console, stopped.result)
-            rest = f" What was finished is in {self.out}; parkenv run {self.out} --resume goes on."
-            has_begun = self.out is not None and (self.out / SPEC_FILE).exists()
-            console.print(f"Interrupted.{rest if has_begun else ''}", soft_wrap=True)
+            rest = f" What was finished is in {out}; parkenv run {out} --resume goes on."
+            console.print(f"Interrupted.{rest if (out / SPEC_FILE).exists() else ''}", soft_wrap=True)
             raise
         self.show(console, result)
-        if self.out is not None:
-            console.print(f"Results are in {self.out}")
-            if self.report:
-                self.write_report(result)
+        console.print(f"Results are in {out}")
+        if self.report:
+            self.write_report(result)
         return result
 
     def write_report(self, result: Result) -> Path:
-        """Write the page on the run; return its path."""
         return make_report(result.folder, self.study)
 
-    @abstractmethod
     def show(self, console: Console, result: Result) -> None:
-        """Print a result, perhaps of an interrupted run."""
+        """Print the tables of a result, perhaps of an interrupted run, and the findings of a finished one."""
+        if result.rows:
+            summary = without_nan(result.summary)
+            for table in self.study.printed(summary, result.folder):
+                print_table(console, table)
+            for line in self.study.findings(summary) if result.complete else ():
+                console.print(line, soft_wrap=True)
 
 
-class AgentStudyCommand(StudyCommand):
-    """A command that runs one kind of study, with agents."""
-
-    trust_model: TrustModel = False
-
-    @classmethod
-    def of(cls, given: Given) -> Self:
-        if "--agents" in given and "--trust-model" in given:
-            given = {**given, "--agents": ",".join(readable_models(split_agents(given["--agents"])))}
-        return super().of(given)
-
-
-COMMANDS = {
-    "compare": "compare:Compare",
-    "commute": "drivers:Commute",
-    "fleet": "drivers:Fleet",
-    "curve": "drivers:Curve",
-    "demand": "occupancy:Demand",
-    "benchmark": "benchmark:RunSuite",
-    "survey": "survey:Survey",
-    "demo": "demo:Demo",
-    "calibrate": "drive:Calibrate",
-    "train": "train:Train",
-    "park": "drive:Park",
-}
-"""The command of each kind of study."""
+def study_command(kind: str) -> type[StudyCommand]:
+    """Return the command of a kind of study, whose fields are its options."""
+    study = study_class(kind)
+    base: Any = command_class(WITH_MORE[kind]) if kind in WITH_MORE else StudyCommand
+    out = option(None, f"Folder for {study.writes}.", short="-o", default=str(study.folder({})))
+    model: Any = {"trust_model": (TrustModel, False)} if "agents" in study.model_fields else {}
+    fields: Any = {"study": (study, study()), "out": (Path | None, out)} | model
+    command: Any = create_model(study.__name__, __base__=base, __doc__=study.__doc__, **fields)
+    command.examples = study.examples
+    return cast(type[StudyCommand], command)
 
 
 class Run(RunCommand, ExecutionSpec):
@@ -163,5 +169,30 @@ class Run(RunCommand, ExecutionSpec):
             given |= {"address"}
         study = study.changed(**{name: getattr(self, name) for name in given})
         options = {name: True for name in ("resume", "overwrite", "report") if getattr(self, name)}
-        command = command_class(COMMANDS[study.kind])
+        command = study_command(study.kind)
         command.parse({"study": study, "out": out or Path("results") / file.stem, **options}, "").run()
+
+
+class Schema(Command):
+    """Editors use them to check and complete files."""
+
+    examples = """
+        parkenv schema scenario
+        parkenv schema --out schemas
+        """
+
+    kind: str | None = option(None, f"{', '.join(KINDS)}.", argument=True, default="scenario; all with --out")
+    out: Path | None = option(None, "Folder for all schemas, KIND.schema.json.", short="-o", default="none")
+
+    def run(self) -> None:
+        from parkenv.files.atomic_write import make_folder
+
+        if self.kind is not None and self.kind not in KINDS:
+            raise InputError(f"KIND is {self.kind!r}; {nearest(self.kind, KINDS)}")
+        texts = {kind: json.dumps(content, indent=1) for kind, content in schemas().items()}
+        if self.out is None:
+            echo(texts[self.kind or "scenario"])
+            return
+        make_folder(self.out)
+        for name, text in texts.items():
+            (self.out / f"{name}.schema.json").write_text(f"{text}\n", encoding="utf-8")

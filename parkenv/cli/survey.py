@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from parkenv.cli.options import Command
 from parkenv.cli.study_command import StudyCommand
@@ -14,34 +14,17 @@ from parkenv.files.option import Inside, option
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.plurals import plural
-from parkenv.show.report.tables import survey_tables, table_of
+from parkenv.show.report.tables import table_of
 from parkenv.studies.fields import Detector, OneScenario
-from parkenv.studies.sensing.survey_study import SurveyStudy
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from parkenv.studies.runner import Result
+from parkenv.studies.sensing.survey_study import COLUMNS, SurveyStudy
 
 MOST_ROWS = 12
 """Slots in the table of a map; files have all."""
 
 
 class Survey(StudyCommand):
-    """Parked cars are detected in the camera images and located with the laser (or the stereo camera).
+    """A survey, which may also record its first session."""
 
-    A Bayes filter estimates the state of each slot. Every drive is one session of the map. Sessions are added to the
-    map in --out: --resume adds further ones to it.
-    """
-
-    examples = """
-        parkenv survey --sessions 21
-        parkenv survey --scenario street --rig stereo --weather rain
-        parkenv survey --hours 12:00-13:00 --days weekend
-        parkenv survey --odometry-drift 0.02 --localise scan-matching
-        """
-
-    study: SurveyStudy = SurveyStudy()
     record: Path | None = option(
         None,
         "Also record images, scans and poses of the first session (extra bags), for `parkenv map-drive`.",
@@ -49,30 +32,21 @@ class Survey(StudyCommand):
         panel="Results",
         default="none",
     )
-    out: Path = option(
-        Path("results/survey"), "Folder for map.sqlite, pictures and summary.json.", short="-o"
-    )
 
     def run(self) -> None:
-        """See `Command`; also record the first session on request."""
+        if self.record is None:
+            self.run_study()
+            return
         from parkenv.mapping.recorded_drive import record_drive, require_recordable
 
-        if self.record is not None:
-            require_recordable(self.record)
-        super().run()
+        require_recordable(self.record)
+        self.run_study()
         console, study = make_console(), self.study
-        if self.record is not None:
-            with console.status(f"Driving the first session once more for {self.record}"):
-                record_drive(study.survey, 0, self.record)
-            again = f"parkenv map-drive {self.record} --scenario {study.scenario.argument}"
-            console.print(f"Recorded: {self.record}; map it with: {again}")
-
-    def show(self, console: Console, result: Result) -> None:
-        """Print the errors of a survey."""
-        for row in result.rows:
-            for table in survey_tables(row, ()):
-                print_table(console, table)
-        console.print(*self.study.findings(result.summary))
+        assert isinstance(study, SurveyStudy)
+        with console.status(f"Driving the first session once more for {self.record}"):
+            record_drive(study.survey, 0, self.record)
+        again = f"parkenv map-drive {self.record} --scenario {study.scenario.argument}"
+        console.print(f"Recorded: {self.record}; map it with: {again}")
 
 
 class MapDrive(Command):
@@ -115,20 +89,27 @@ class MapDrive(Command):
         from parkenv.scenarios.build import build
         from parkenv.studies.sensing.recorded_session import add_recording
 
-        its = build(self.scenario)
+        scenario = build(self.scenario)
         calibration = None if self.calibration is None else DriveCalibration.read(self.calibration)
         console = make_console()
         with stages(console, "captures") as progress:
             row = add_recording(
-                self.recording, its, self.out, calibration=calibration, detector=self.detector or its.detector,
-                every=self.every, localise=self.localise, photos=self.photos, lot_file=self.scenario.lot.file,
+                self.recording,
+                scenario,
+                self.out,
+                calibration=calibration,
+                detector=self.detector or scenario.detector,
+                every=self.every,
+                localise=self.localise,
+                photos=self.photos,
+                lot_file=self.scenario.lot.file,
                 progress=progress,
-            )  # fmt: skip
+            )
         save_summary(self.out, None, [row])
-        print_table(console, table_of("", "The drive", [row], facts=True))
+        print_table(console, table_of("", "The drive", [row], COLUMNS, facts=True))
         driven_in = row["key"].partition("/")[0]
-        if driven_in in SCENARIO_NAMES and driven_in != its.name:
-            text = f"The drive was recorded in {driven_in}, and is mapped in {its.name}: see --scenario"
+        if driven_in in SCENARIO_NAMES and driven_in != scenario.name:
+            text = f"The drive was recorded in {driven_in}, and is mapped in {scenario.name}: see --scenario"
             console.print(text, style="yellow")
         if not row["seen"]:
             why = f": poses ± {row['pose_error_m']:.2g} m; see --pose-error" if "pose_error_m" in row else ""
@@ -166,39 +147,39 @@ class Map(Command):
         from parkenv.world.occupancy.arrival_window import DAY_NAMES
         from parkenv.world.week import DAY_S, HOUR_S
 
-        its, slot, hour = build(self.scenario), self.slot, self.hour
-        ids = its.lot.slot_ids
+        scenario, slot, hour = build(self.scenario), self.slot, self.hour
+        lot, ids = scenario.lot, scenario.lot.slot_ids
         if slot is not None and slot not in ids:
             hint = nearest(slot, ids) if len(ids) <= MOST_ROWS else nearest(slot, ids).partition("known:")[0]
             raise InputError(
-                f"--slot {slot}: lot {its.name!r} has no such slot; {hint or f'its first is {ids[0]!r}'}"
+                f"--slot {slot}: lot {scenario.name!r} has no such slot; {hint or f'its first is {ids[0]!r}'}"
             )
-        with MapStore(self.map_file, its.lot, create=False) as store:
+        with MapStore(self.map_file, lot, create=False) as store:
             log = store.log()
         time, when = None, "over all sessions"
         if self.weekday is not None:
             time = DAY_NAMES.index(self.weekday) * DAY_S + min(hour * HOUR_S, DAY_S - 1.0)
             when = f"{self.weekday} {int(hour):02d}:{int(hour % 1 * 60):02d}"
-        found = predict(log, time, confidence=self.confidence)
+        predicted = predict(log, time, confidence=self.confidence)
         rows = [
             {
                 "slot": name,
-                "p_occupied": float(found.p_occupied[i]),
-                "low": float(found.low[i]),
-                "high": float(found.high[i]),
-                "sessions": int(found.sessions[i]),
+                "p_occupied": float(predicted.p_occupied[i]),
+                "low": float(predicted.low[i]),
+                "high": float(predicted.high[i]),
+                "sessions": int(predicted.sessions[i]),
             }
             for i, name in enumerate(ids)
             if slot in (None, name)
         ]
         console = make_console()
         free = sorted(rows, key=lambda row: float(str(row["p_occupied"])))[:MOST_ROWS]
-        print_rows(console, f"{its.name}, {when}, {plural(len(log.time), 'session')}", free, rows[0])
+        print_rows(console, f"{scenario.name}, {when}, {plural(len(log.time), 'session')}", free)
         if len(rows) > MOST_ROWS:
             console.print(f"The {MOST_ROWS} most likely free of {len(rows)}; --out writes all.")
         if self.out is not None:
             make_folder(self.out)
-            save_map(its.lot, found, None, f"{its.name}, {when}", self.out / "map.png")
+            save_map(lot, predicted, None, f"{scenario.name}, {when}", self.out / "map.png")
             write_csv(self.out / "slots.csv", list(rows[0]), rows)
             save_summary(self.out, None, rows)
             console.print(f"Written: {self.out / 'map.png'}, slots.csv, summary.json")

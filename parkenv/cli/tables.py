@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Thread
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from parkenv.files.file_names import is_plain
@@ -20,10 +19,13 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
     from rich.table import Table
 
-    from parkenv.show.report.tables import Column
+    from parkenv.show.columns import Column
 
 WIDE = 1000
 """Width assumed if output goes to a file or a pipe, characters: no column of a table is cut there."""
+
+MOST_ROWS = 60
+"""Rows of a table that are printed."""
 
 
 def make_console(*, soft_wrap: bool = False) -> Console:
@@ -68,24 +70,25 @@ def print_rows(
     console: Console,
     title: str,
     rows: Sequence[Mapping[str, Any]],
-    keys: Collection[str],
-    columns: Mapping[str, Column] = MappingProxyType({}),
+    keys: Collection[str] = (),
+    columns: Sequence[Column] = (),
 ) -> None:
-    """Print some columns of results as a page shows them."""
-    from parkenv.show.report.tables import table_of
+    """Print results as a page shows them: some columns, or all."""
+    from parkenv.show.report.tables import part_of, table_of
 
-    kept = [{key: row[key] for key in row if key.removesuffix("_ci95") in keys} for row in rows]
-    print_table(console, table_of("", title, kept, columns=columns))
+    table = table_of("", title, rows, columns)
+    print_table(console, part_of(table, keys) if keys else table)
 
 
 def print_table(console: Console, table: Mapping[str, Any]) -> None:
-    """Print a table of `parkenv.show.report.tables.table_of`.
+    """Print a table of `parkenv.show.report.tables.table_of`, or the first `MOST_ROWS` of its rows.
 
     What is equal in all rows, and not 0, stands above the table. A narrow terminal gets several tables, each of which
     begins with the columns that name the rows.
     """
     from parkenv.show.report.tables import written
 
+    rows = table["rows"][:MOST_ROWS]
     equal = [
         f"{column['label']} {written(column, column['value'])} {column.get('unit', '')}".rstrip()
         for column in table["same"]
@@ -93,7 +96,7 @@ def print_table(console: Console, table: Mapping[str, Any]) -> None:
     ]
     title = f"{table['title']}: {', '.join(equal)}" if equal else table["title"]
     headings, cells, n_names = list[str](), list[list[str]](), 0
-    for column, *values in zip(table["columns"], *table["rows"], strict=True):
+    for column, *values in zip(table["columns"], *rows, strict=True):
         if not any(texts := [written(column, value) for value in values]):
             continue
         has_numbers = any(isinstance(value, float | int | list) for value in values)
@@ -118,8 +121,10 @@ def print_table(console: Console, table: Mapping[str, Any]) -> None:
             parts.append(list(range(n_names)))
         parts[-1].append(i)
     for number, part in enumerate(parts):
-        made = zip(*(cells[i] for i in part), strict=True)
-        console.print(make_table(None if number else title, [headings[i] for i in part], made, n_names))
+        lines = zip(*(cells[i] for i in part), strict=True)
+        console.print(make_table(None if number else title, [headings[i] for i in part], lines, n_names))
+    if len(rows) < len(table["rows"]):
+        console.print(f"The first {len(rows)} of {len(table['rows'])} rows; files have all.")
 
 
 @contextmanager
@@ -172,8 +177,8 @@ def _show_compiling(progress: Progress, ended: Event) -> None:
     since_s, line = time.time(), progress.add_task("", total=None, visible=False, unit="functions")
     while not ended.wait(0.5):
         names, n_finished = compiling_now(since_s)
-        said = f"Compiling {', '.join(names[:3])}"
-        progress.update(line, visible=bool(names), description=said, completed=n_finished)
+        text = f"Compiling {', '.join(names[:3])}"
+        progress.update(line, visible=bool(names), description=text, completed=n_finished)
 
 
 @contextmanager

@@ -75,7 +75,7 @@ def readable_models(agents: Sequence[str]) -> list[str]:
         if algorithm in ALGORITHMS and file.endswith(".zip"):
             from planners.model_file import convert_archive
 
-            made = convert_archive(algorithm, file)
-            typer.echo(f"Converted: {made}; from now on, name that file")
-            readable[i] = f"{algorithm}:{made}"
+            converted = convert_archive(algorithm, file)
+            typer.echo(f"Converted: {converted}; from now on, name that file")
+            readable[i] = f"{algorithm}:{converted}"
     return readable

@@ -74,12 +74,10 @@ class Inside:
     only: tuple[str, ...] | None = None
 
     def has(self, name: str) -> bool:
-        """Return whether the option is one of the command's."""
         return name not in self.without and (self.only is None or name in self.only)
 
 
 def words_in(text: str) -> list[str]:
-    """Split text at commas."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not words:
         raise InputError(f"is {text!r}, want values separated by commas")
@@ -106,7 +104,6 @@ def numbers_in(text: str, count: int | None = None) -> list[float]:
 
 
 def seconds_of_minutes(text: str) -> float:
-    """Convert minutes to s."""
     return 60.0 * numbers_in(text, 1)[0]
 
 

@@ -20,7 +20,7 @@ from pydantic import (
 )
 from pydantic.annotated_handlers import GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, ErrorDetails
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.atomic_write import write_text
@@ -103,6 +103,12 @@ class OrText:
 
 Several = Annotated[tuple[T, ...], Strict(False)]
 """A list in the file, a tuple in Python."""
+
+
+def require(condition: object, message: str) -> None:
+    """Refuse a specification whose fields do not fit together, in its validator."""
+    if not condition:
+        raise PydanticCustomError("whole", "{message}", {"message": message})
 
 
 def _different(values: tuple[T, ...]) -> tuple[T, ...]:

@@ -40,7 +40,7 @@ from parkenv.files.known_names import (
     SensorModelName,
 )
 from parkenv.files.limited_reading import is_there
-from parkenv.files.option import Option, numbers_in, option, seconds_of_minutes
+from parkenv.files.option import numbers_in, option, seconds_of_minutes, words_in
 from parkenv.files.spec_file import (
     FilePath,
     OrText,
@@ -242,16 +242,7 @@ class CountsSpec(_Popularity):
         description="Counts: car_park,capacity,hour,free, each at its hour's end, or `time` for points in "
         "time; .csv, .csv.gz."
     )
-    car_park: Annotated[
-        str,
-        Option(
-            takes="NAME[,NAME...]|all",
-            panel="World",
-            description="With --occupancy as a file of hourly counts, car_park,capacity,hour,free: replay the "
-            "days of these car parks on the lot, each as a separate scenario. all: all car parks in "
-            "use.",
-        ),
-    ] = Field(description="Name of the car park in the file.")
+    car_park: str = Field(description="Name of the car park in the file.")
     timezone: str = Field("Europe/Berlin", description="Local time zone, for `hour_utc` and `time_utc`.")
 
 
@@ -268,6 +259,15 @@ class OccupancySpec(Spec):
         )
     )
     counts: CountsSpec | None = None
+    car_parks: Several[str] | None = option(
+        None,
+        "With --occupancy as a file of hourly counts, car_park,capacity,hour,free: replay the days of these car parks "
+        "on the lot, each as a separate scenario. all: all car parks in use.",
+        name="--car-park",
+        takes="NAME[,NAME...]|all",
+        panel="World",
+        parse=words_in,
+    )
     world: str | None = Field(
         None,
         description="An `OccupancyModel` of your own, `MODULE:CLASS` with any options in brackets: a class whose first "
@@ -315,6 +315,8 @@ class OccupancySpec(Spec):
             raise ValueError(
                 "day_error cannot be combined with a log or counts, whose days differ by themselves"
             )
+        if self.car_parks and (self.log is None or self.replay_from is None):
+            raise ValueError("car_parks only together with a file of counts as the log, and replay_from")
         if self.mapping is not None and self.log is None:
             raise ValueError("mapping only together with a log")
         if self.replay_from is not None and not recorded:

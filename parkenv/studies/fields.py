@@ -6,17 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema
-from pydantic_core import PydanticCustomError
 
-from parkenv.errors import InputError, nearest
-from parkenv.files.known_names import (
-    SCENARIO_NAMES,
-    SCENE_LEVELS,
-    RigName,
-)
+from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
+from parkenv.files.known_names import SCENARIO_NAMES, RigName
 from parkenv.files.limited_reading import is_there
 from parkenv.files.option import Inside, Option, seconds_of_minutes, words_in
-from parkenv.files.spec_file import Axis, DetectorName, OrText, Several
+from parkenv.files.spec_file import Axis, DetectorName, OrText, Several, require
 from parkenv.scenarios.spec import (
     ScenarioSpec,
     TrafficSpec,
@@ -50,10 +46,37 @@ def _with_folders(value: object, info: ValidationInfo) -> object:
         return value
     folder = Path((info.context or {}).get("folder", Path()))
     listed: list[object] = []
-    for one in value:
-        at = folder / one if isinstance(one, str | Path) and str(one) not in SCENARIO_NAMES else None
-        listed += scenario_specs(at) if at is not None and is_there(at) and at.is_dir() else [one]
+    for item in value:
+        at = folder / item if isinstance(item, str | Path) and str(item) not in SCENARIO_NAMES else None
+        listed += scenario_specs(at) if at is not None and is_there(at) and at.is_dir() else [item]
     return listed
+
+
+def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...]:
+    """Replace scenarios that replay several car parks of a file of counts by one for each."""
+    listed: list[ScenarioSpec] = []
+    for scenario in scenarios:
+        names, file = scenario.occupancy.car_parks, (scenario.occupancy.log or (None,))[0]
+        if names is None or file is None:
+            listed.append(scenario)
+            continue
+        if names == ("all",):
+            from parkenv.scenarios.build import car_parks
+
+            names = tuple(car_parks(file))
+        for name in names:
+            title = file_name(f"{scenario.title} {name}").replace(",", " ")[:80]
+            counts = {"file": file, "car_park": name}
+            occupancy = scenario.occupancy.changed("--car-park", log=None, car_parks=None, counts=counts)
+            listed.append(scenario.changed("--car-park", name=title, occupancy=occupancy, forecast="own"))
+    return tuple(listed)
+
+
+def _one_car_park(scenario: ScenarioSpec) -> ScenarioSpec:
+    scenarios = _by_car_park((scenario,))
+    if len(scenarios) > 1:
+        raise InputError(f"--car-park names {len(scenarios)} scenarios, want one")
+    return scenarios[0]
 
 
 def one_word(text: str) -> str:
@@ -74,24 +97,6 @@ _LOT_ALONE = (
 )
 
 
-def levels_in(text: str) -> object:
-    """Return the levels that an option names."""
-    return SCENE_LEVELS if text == "all" else words_in(text)
-
-
-def _known_levels(levels: tuple[str, ...]) -> tuple[str, ...]:
-    for level in levels:
-        if level not in SCENE_LEVELS:
-            raise PydanticCustomError(
-                "whole",
-                "levels is {given}; {near}",
-                {"given": repr(level), "near": nearest(level, SCENE_LEVELS)},
-            )
-    return levels
-
-
-SceneLevels = Annotated[Axis[str], AfterValidator(_known_levels)]
-"""Names of levels of drawn scenes; see `parkenv.driving.levels`."""
 PRICES = ("--price", "--value-of-time", "--stay-min")
 """Options of what parking costs, which only matters where slots are chosen."""
 TRAFFIC = ("--cars", "--pedestrians")
@@ -101,6 +106,7 @@ SCENARIOS_HELP = f"{_NAMES}; scenario files (.toml), lots (.geojson), or folders
 ScenarioList = Annotated[
     Several[ScenarioItem],
     BeforeValidator(_with_folders),
+    AfterValidator(_by_car_park),
     Field(min_length=1, max_length=1_000, description=SCENARIOS_HELP),
 ]
 """Scenarios in a file: names, files, folders of scenario and lot files, or inline tables."""
@@ -114,6 +120,7 @@ Scenarios = Annotated[
 """The scenarios of a study."""
 OneScenario = Annotated[
     ScenarioItem,
+    AfterValidator(_one_car_park),
     Field(description=f"{_NAMES}, a scenario file (.toml), or a lot (.geojson)."),
     Option("--scenario", takes="NAME|FILE", parse=one_word),
     Option(
@@ -154,7 +161,6 @@ Seed = Annotated[int, Field(ge=0, lt=2**31, description="First seed; episode i u
 
 
 def _vehicle(value: object, info: ValidationInfo) -> object:
-    """Return the car of a name, a file or a table."""
     if value is None:
         return None
     from parkenv.driving.scene_files import vehicle_of
@@ -246,17 +252,13 @@ def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[Scena
         ("scenarios", [scenario.title for scenario in scenarios]),
     ):
         repeated = [name for i, name in enumerate(names) if name in names[:i]]
-        if repeated:
-            raise PydanticCustomError("whole", f"{what} has {{name}} twice", {"name": repr(repeated[0])})
+        require(not repeated, f"{what} has {next(iter(repeated), '')!r} twice")
 
 
 def require_at_most(count: int, what: str, unit: str, most: int = MAX_EPISODES) -> None:
-    """Check the size of a study."""
-    if count > most:
-        raise PydanticCustomError("whole", f"{what} is {count} {unit}, want at most {most}")
+    require(count <= most, f"{what} is {count} {unit}, want at most {most}")
 
 
 def require_rig(rig: str | None, detector: str | None) -> None:
     """Check that a detector has images."""
-    if detector is not None and rig is None:
-        raise PydanticCustomError("whole", "detector requires a rig, such as laser")
+    require(detector is None or rig is not None, "detector requires a rig, such as laser")

@@ -12,7 +12,7 @@ import numpy as np
 
 from parkenv.errors import InputError
 from parkenv.forecast.comparison import MODELS, Compared, compare
-from parkenv.forecast.counts import Counts
+from parkenv.forecast.counts import Counts, is_counts
 from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
 from parkenv.forecast.slot_comparison import ComparedSlots, compare_slot_days
 from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
@@ -25,26 +25,38 @@ from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.week import DAY_S, HOUR_S
 
 
-class Found(NamedTuple):
-    """What was found.
+class FitReport(NamedTuple):
+    """Results of a fit or an evaluation.
 
     Attributes:
-        title: what it was found in.
+        title: name of the data.
         summary: content of `summary.json`; `rows` is its table.
+        notes: faults of the data, and what the rows leave out.
     """
 
     title: str
     summary: Row
+    notes: Sequence[str] = ()
 
 
-def fit_log(log: Path, folder: Path, *, max_gap_s: float = 7200.0) -> Found:
-    """Fit arrival and departure rates to a log of slots; write process.json and rates.png.
+def fit(log: Path, folder: Path, *, max_gap_s: float, timezone: str, progress: Progress) -> FitReport:
+    """Fit a model to a log of slots, or to counts of car parks.
 
     Args:
-        log: the log.
-        folder: where the files go.
-        max_gap_s: observations farther apart are not linked, s.
+        log: the log or the counts.
+        folder: where files go.
+        max_gap_s: observations of a log that are farther apart are not linked, s.
+        timezone: local time zone of counts in UTC.
+        progress: called as steps and days are finished.
     """
+    if is_counts(log):
+        return _fit_counts(Counts.read(log, timezone), progress)
+    progress("Fitting rates", 0, 0)
+    return _fit_log(log, folder, max_gap_s)
+
+
+def _fit_log(log: Path, folder: Path, max_gap_s: float) -> FitReport:
+    """Fit arrival and departure rates to a log of slots; write process.json and rates.png."""
     fitted = fit_process(OccupancyLog.read(log), max_gap_s=max_gap_s)
     process = fitted.process
     process.to_file(folder / "process.json")
@@ -62,16 +74,13 @@ def fit_log(log: Path, folder: Path, *, max_gap_s: float = 7200.0) -> Found:
     ]
     counts = {"log_likelihood": fitted.log_likelihood, "intervals": fitted.n_intervals}
     title = f"{log.name}: {plural(len(fitted.slot_ids), 'slot')}, {plural(fitted.n_intervals, 'interval')}"
-    return Found(title, {"rows": rows, **counts, "day_error": asdict(process.day_error)})
+    summary = {"rows": rows, **counts, "day_error": asdict(process.day_error)}
+    note = f"Days differ from the process by a standard deviation of {process.day_error.level:.2f} logits"
+    return FitReport(title, summary, [note])
 
 
-def fit_counts(counts: Counts, progress: Progress = lambda *_: None) -> Found:
-    """Estimate by how much days of whole car parks differ from their forecasts, and the typical week.
-
-    Args:
-        counts: the counts.
-        progress: called as steps and days are finished.
-    """
+def _fit_counts(counts: Counts, progress: Progress) -> FitReport:
+    """Estimate by how much days of whole car parks differ from their forecasts, and the typical week."""
     n = len(counts.days)
     settings = fit_settings(counts, n, counted(progress, "Fit", FIT_STEPS))
     forecast = forecast_days(counts, 0, "rolling", settings, lambda day: progress("Forecast days", day, n))
@@ -101,26 +110,47 @@ def fit_counts(counts: Counts, progress: Progress = lambda *_: None) -> Found:
         "faults": counts.total_faults(),
         "typical_week": typical_week,
     }
-    return Found(f"{counts.source}: {plural(n, 'day')}", summary)
+    drift = f"Levels drift by {summary['level_drift_per_week']:.2f} logits a week"
+    return FitReport(f"{counts.source}: {plural(n, 'day')}", summary, [*_faults(counts), drift])
 
 
-def evaluate_counts(
-    counts: Counts,
+def _faults(counts: Counts) -> list[str]:
+    faults = ", ".join(f"{name.replace('_', ' ')} {n:,}" for name, n in counts.total_faults().items() if n)
+    return [f"Faults: {faults or 'none'}", *(f"{name}: {what}" for name, what in counts.idle().items())]
+
+
+def evaluate(
+    log: Path,
     folder: Path,
     *,
-    from_day: date | None = None,
-    seed: int = 0,
-    progress: Progress = lambda *_: None,
-) -> Found:
-    """Score forecasts of car parks, each day from the days before it; draw a picture of each model.
+    from_day: date | None,
+    car_parks: Sequence[str] | None,
+    timezone: str,
+    seed: int,
+    progress: Progress,
+) -> FitReport:
+    """Score forecasts of counts of car parks, or of a log of slots; draw a picture of each model.
 
     Args:
-        counts: the counts.
+        log: the counts or the log.
         folder: where the pictures go.
         from_day: first day that is scored; None: halfway.
+        car_parks: those of the counts that are scored; None for all.
+        timezone: local time zone of counts in UTC.
         seed: seed of the bootstrap.
         progress: called as steps, days and models are finished.
     """
+    if not is_counts(log):
+        return _evaluate_log(log, folder, from_day, seed, progress)
+    counts = Counts.read(log, timezone)
+    counts = counts if car_parks is None else counts.chosen(list(car_parks))
+    return _evaluate_counts(counts, folder, from_day, seed, progress)
+
+
+def _evaluate_counts(
+    counts: Counts, folder: Path, from_day: date | None, seed: int, progress: Progress
+) -> FitReport:
+    """Score forecasts of car parks, each day from the days before it."""
     n = len(counts.days)
     first = n // 2 if from_day is None else counts.day_index(from_day)
     if not np.isfinite(counts.occupied[:, first:]).any():
@@ -142,39 +172,25 @@ def evaluate_counts(
         "idle": counts.idle(),
         "variances": asdict(settings),
     }
-    return Found(_scored(rows[0], plural(rows[0]["car_parks"], "car park"), summary), summary)
+    title = _scored(rows[0], plural(rows[0]["car_parks"], "car park"), summary)
+    return FitReport(title, summary, _faults(counts))
 
 
-def evaluate_log(
-    log: Path,
-    folder: Path,
-    *,
-    from_day: date | None = None,
-    seed: int = 0,
-    progress: Progress = lambda *_: None,
-) -> Found:
-    """Score forecasts of every slot of a log in each half-hour; draw a picture of each model.
-
-    Args:
-        log: the log.
-        folder: see `evaluate_counts`.
-        from_day: see `evaluate_counts`.
-        seed: see `evaluate_counts`.
-        progress: called as days are finished.
-    """
+def _evaluate_log(log: Path, folder: Path, from_day: date | None, seed: int, progress: Progress) -> FitReport:
+    """Score forecasts of every slot of a log in each half-hour."""
     recorded = OccupancyLog.read(log)
     first = recorded.days[len(recorded.days) // 2] if from_day is None else str(from_day)
     classes = [np.flatnonzero(recorded.weekend == weekend) for weekend in (False, True)]
     days = [recorded.slot_days(days) for days in classes if days.size]
     done = counted(progress, "Forecast days", sum(day >= first for day in recorded.days))
-    found: Sequence[ComparedSlots] = compare_slot_days(days, date.fromisoformat(first).toordinal(), done)
-    if not found:
+    models: Sequence[ComparedSlots] = compare_slot_days(days, date.fromisoformat(first).toordinal(), done)
+    if not models:
         raise InputError(f"--from is {first}: {log} has no day from then on with one of its class before it")
-    for compared in found:
+    for compared in models:
         save_forecast(shown_slots(compared, log.name), folder / f"{compared.model}.png")
-    rows = [_row(compared, found[0], seed) for compared in found]
+    rows = [_row(compared, models[0], seed) for compared in models]
     summary = {"rows": rows, "first_day": first}
-    return Found(_scored(rows[0], plural(len(recorded.slot_ids), "slot"), summary), summary)
+    return FitReport(_scored(rows[0], plural(len(recorded.slot_ids), "slot"), summary), summary)
 
 
 def _scored(row: Row, what: str, summary: Row) -> str:

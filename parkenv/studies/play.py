@@ -29,7 +29,6 @@ class _Actions(Observer):
     taken = ""
 
     def on_step(self, step: Step) -> None:
-        """Add an action."""
         self.taken += str(int(step.action))
 
 
@@ -103,7 +102,6 @@ def _changes(world: World, slot: int, begin: float, end: float) -> list[float]:
 
 
 def _floats(values: ArrayLike) -> str:
-    """Return numbers as the base64 text of little-endian float64."""
     return base64.b64encode(np.asarray(values, "<f8").tobytes()).decode()
 
 

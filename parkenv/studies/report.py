@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 from pydantic import Field
 
@@ -16,7 +16,7 @@ from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.show.report.page import Page, page_data, write_page
 from parkenv.show.report.tables import tables_of
 from parkenv.studies.fingerprints import require_unchanged
-from parkenv.studies.report_options import ReportOptions
+from parkenv.studies.report_options import NotInRunError, ReportOptions
 from parkenv.studies.results import PAGE, SETTINGS, SPEC_FILE, SUMMARY, SUMMARY_PARTIAL
 from parkenv.studies.study import STUDIES, Progress, Study, read_study, study_class
 from parkenv.studies.workers import SERIAL, Task, Workers
@@ -40,13 +40,6 @@ class ReplayJob(NamedTuple):
 
     tasks: Sequence[Task[Recording]] = ()
     notes: Sequence[str] = ()
-
-
-class Replay(Protocol):
-    """Something in a run that a page can show again, such as its searches."""
-
-    def again(self, options: ReportOptions) -> ReplayJob:
-        """Return what runs again."""
 
 
 class Summary(Spec, extra="allow"):
@@ -76,7 +69,6 @@ class RunFolder:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a run folder."""
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; want one that a command with --out wrote")
         file = path / SUMMARY
@@ -114,7 +106,7 @@ class RunFolder:
         return read_study(self.path / SPEC_FILE) if self.kind in STUDIES else None
 
     @property
-    def again(self) -> list[str]:
+    def command(self) -> list[str]:
         """The words of a command that repeats the run in a folder beside it; its own if it may replace the run."""
         words = [
             str(self.path / SPEC_FILE) if word == SPEC_FILE else str(word) for word in self.summary["command"]
@@ -122,19 +114,17 @@ class RunFolder:
         if self.kind not in STUDIES or {"--resume", "--overwrite"} & set(words):
             return words
         out, path = ("--out", "-o"), self.path if self.path.name else self.path.resolve()
-        others = [
-            word for word, before in zip(words, ["", *words], strict=False) if not {word, before} & {*out}
-        ]
-        return [*(word for word in others if not word.startswith("--out=")), "--out", f"{path}-again"]
+        pairs = zip(words, ["", *words], strict=False)
+        others = [w for w, before in pairs if not {w, before} & {*out} and not w.startswith("--out=")]
+        return [*others, "--out", f"{path}-again"]
 
     @property
     def figures(self) -> list[Path]:
-        """The PNG files in the folder, by name."""
         return sorted(self.path.glob("*.png"))
 
     def data(self, recordings: Sequence[Recording] = (), notes: Sequence[str] = ()) -> dict[str, Any]:
         """Return the data of the run's page; see `page_data`."""
-        return page_data(self.kind, self.page, {**self.summary, "command": self.again}, recordings, notes)
+        return page_data(self.kind, self.page, {**self.summary, "command": self.command}, recordings, notes)
 
 
 def write_report(
@@ -166,22 +156,23 @@ def write_report(
     options = options or ReportOptions()
     path = out or run.path / PAGE
     make_folder(path.parent)
-    told, replays = [*notes], list[Replay]()
+    notes, jobs = [*notes], list[ReplayJob]()
     try:
         if study is not None:
             require_unchanged(study, run.path)
-            replays += study.replays(run.path)
+            jobs += study.replays(run.path, options)
+    except NotInRunError:
+        raise
     except (InputError, OSError) as error:
         # The page still has tables and figures.
-        told.append(f"There is no replay: {error}")
-    jobs = [replay.again(options) for replay in replays]
-    told += [note for job in jobs for note in job.notes]
+        notes.append(f"There is no replay: {error}")
+    notes += [note for job in jobs for note in job.notes]
     tasks = [task for job in jobs for task in job.tasks]
     recordings = [*(options.drives or ())]
     progress(doing, 0, len(tasks))
     for number, recording in enumerate(workers.in_order(tasks), start=1):
         recordings.append(recording)
         progress(doing, number, len(tasks))
-    told += [note for recording in recordings for note in recording.get("differences", ())]
-    write_page(run.data(recordings, told), path, run.figures)
-    return path, told
+    notes += [note for recording in recordings for note in recording.get("differences", ())]
+    write_page(run.data(recordings, notes), path, run.figures)
+    return path, notes

@@ -13,6 +13,10 @@ from parkenv.files.spec_file import Several, Spec
 from parkenv.studies.agent_spec import split_agents
 
 
+class NotInRunError(InputError):
+    """A search, a day or an agent was chosen that the run does not have."""
+
+
 class ReportOptions(Spec):
     """What a page replays."""
 
@@ -40,16 +44,15 @@ class ReportOptions(Spec):
     )
 
     def chosen_agents(self, known: Sequence[str]) -> Sequence[str]:
-        """Return which of the agents of a run are replayed."""
         for name in self.agents or ():
             if name not in known:
-                raise InputError(f"--agents has {name!r}; {nearest(name, list(dict.fromkeys(known)))}")
+                raise NotInRunError(f"--agents has {name!r}; {nearest(name, list(dict.fromkeys(known)))}")
         return known if self.agents is None else self.agents
 
     def chosen_numbers(self, known: Sequence[int]) -> list[int] | None:
         """Return which seeds or days of a run are replayed; None to choose them."""
         for number in self.numbers or ():
             if number not in known:
-                theirs = f"{known[0]} to {known[-1]}" if known else "none"
-                raise InputError(f"--replay has {number:g}; this run's are {theirs}")
+                span = f"{known[0]} to {known[-1]}" if known else "none"
+                raise NotInRunError(f"--replay has {number:g}; this run's are {span}")
         return None if self.numbers is None else [int(number) for number in self.numbers]

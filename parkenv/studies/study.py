@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import itertools
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import BackendName
@@ -28,8 +28,10 @@ from parkenv.studies.results import (
 from parkenv.studies.workers import Task, Workers
 
 if TYPE_CHECKING:
+    from parkenv.show.columns import Column
     from parkenv.show.report.page import Page
-    from parkenv.studies.report import Replay
+    from parkenv.studies.report import ReplayJob
+    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
 
 STUDIES: Mapping[str, str] = {
@@ -122,6 +124,10 @@ class Study(ExecutionSpec):
         doing, unit: what the progress bar says and counts.
         heading: heading of the report, before the scenarios; the kind if empty.
         table_titles: titles of the tables of the report, by their entries in the summary.
+        columns: columns of the tables, besides those that all searches have.
+        shown: tables that the terminal shows, by name, and their columns; all if empty.
+        examples: command lines for the help page.
+        writes: what the folder holds, for the help page.
     """
 
     kind: str
@@ -132,6 +138,10 @@ class Study(ExecutionSpec):
     unit: ClassVar[str] = "episodes"
     heading: ClassVar[str] = ""
     table_titles: ClassVar[Mapping[str, str]] = {"rows": "Results"}
+    columns: ClassVar[Sequence[Column]] = ()
+    shown: ClassVar[Mapping[str, Collection[str]]] = {"rows": ()}
+    examples: ClassVar[str] = ""
+    writes: ClassVar[str] = "the results"
 
     def __getstate__(self) -> dict[Any, Any]:
         """Workers make scenarios themselves, once each."""
@@ -185,21 +195,55 @@ class Study(ExecutionSpec):
             InputError: a file in the folder is damaged.
         """
         from parkenv.show.report.page import Page, on_scenarios
-        from parkenv.show.report.tables import tables_of
 
-        del folder
         title = f"{cls.heading}{on_scenarios(summary['rows'])}"
         if not cls.heading:
             title = f"parkenv {cls.model_fields['kind'].default}"
-        return Page(title, cls.findings(summary), tables_of(summary, cls.table_titles))
+        return Page(title, cls.findings(summary), cls.page_tables(summary, folder))
 
-    def replays(self, folder: Path) -> Sequence[Replay]:
-        """Return what of the run in a folder a report may show again; nothing by default.
+    @classmethod
+    def page_tables(cls, summary: Row, folder: Path) -> list[Row]:
+        """Return the tables of a report; see `page`."""
+        from parkenv.show.report.tables import tables_of
+
+        del folder
+        return tables_of(summary, cls.table_titles, cls.columns)
+
+    @classmethod
+    def printed(cls, summary: Row, folder: Path) -> list[Row]:
+        """Return the tables that a terminal shows; see `page`."""
+        from parkenv.show.report.tables import part_of
+
+        tables = {table["name"]: table for table in cls.page_tables(summary, folder)}
+        return [
+            part_of(tables[name], keys) if keys else tables[name]
+            for name, keys in cls.shown.items()
+            if name in tables
+        ]
+
+    @classmethod
+    def folder(cls, given: Mapping[str, Any]) -> Path:
+        """Return where a command with these options, `--episodes` or `SUITE`, puts the results."""
+        del given
+        return Path("results") / str(cls.model_fields["kind"].default)
+
+    def with_options(self, given: Mapping[str, Any], *, resumed: bool) -> Self:
+        """Return the study with what several options of a command mean together.
+
+        Args:
+            given: the options, such as `--episodes`, and their texts.
+            resumed: whether the study is that of a run to continue.
+        """
+        del given, resumed
+        return self
+
+    def replays(self, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
+        """Return what of the run in a folder a report shows again; nothing by default.
 
         Raises:
             InputError, OSError: the run cannot be repeated.
         """
-        del folder
+        del folder, options
         return ()
 
     def keys(self, work: Any, item: Any) -> list[Key]:

@@ -2,89 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.curve.study import CurveStudy
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.runner import Result, run
 from parkenv.studies.sensing.survey_study import SurveyStudy
-from parkenv.studies.study import Progress, Study
+from parkenv.studies.study import ExecutionSpec, Progress, Study
 from parkenv.studies.training.spec import TrainingSpec
 
-_DOC = """{does}
+_DOC = """Run a study of kind `{kind}`, as `parkenv {kind}` does.
+
+    {about}
 
     Args:
         folder: where the results go; None for a temporary folder that lasts as long as the result.
         resume: continue an earlier run in the folder.
         overwrite: replace another run in the folder.
         progress: called as rows finish; see `parkenv.studies.study.Progress`.
-        fields: fields of the specification, as in a file of kind `{kind}`: {fields} and others.
+        fields: fields of the specification, as in a file of this kind: {fields}.
 
     Raises:
         InputError: a field is unknown or out of range, or the folder cannot be used.
     """
 
 
-class Verb(Protocol):
-    """A function that runs one kind of study."""
-
-    def __call__(
-        self,
-        *,
-        folder: Path | str | None = None,
-        resume: bool = False,
-        overwrite: bool = False,
-        progress: Progress | None = None,
-        **fields: Any,
-    ) -> Result:
-        """Run the study; see `_DOC`."""
-
-
-def _verb(study_class: type[Study], does: str, fields: str) -> Verb:
+def verb(study: type[Study]) -> Callable[..., Result]:
     """Return the function that runs a kind of study and is named after it."""
-    kind = study_class.model_fields["kind"].default
+    kind = study.model_fields["kind"].default
 
-    def verb(
+    def run_study(
         *,
         folder: Path | str | None = None,
         resume: bool = False,
         overwrite: bool = False,
-        progress: Progress | None = None,
+        progress: Progress = lambda *_: None,
         **fields: Any,
     ) -> Result:
-        study = study_class.parse(fields, f"parkenv.{kind}()")
-        quiet = progress or (lambda *_: None)
-        return run(study, folder, resume=resume, overwrite=overwrite, progress=quiet, command=())
+        spec = study.parse(fields, f"parkenv.{kind}()")
+        return run(spec, folder, resume=resume, overwrite=overwrite, progress=progress, command=())
 
-    verb.__name__ = verb.__qualname__ = kind
-    verb.__doc__ = _DOC.format(does=does, kind=kind, fields=fields)
-    return verb
+    own = [name for name in study.model_fields if name not in {"kind", *ExecutionSpec.model_fields}]
+    run_study.__name__ = run_study.__qualname__ = kind
+    run_study.__doc__ = _DOC.format(kind=kind, about=study.__doc__, fields=", ".join(own))
+    return run_study
 
 
-compare = _verb(
-    Comparison,
-    "Compare agents over scenarios and settings, all in the same worlds.",
-    "`agents`, `scenarios`, `grid`, `episodes`, `seed`",
-)
-fleet = _verb(
-    FleetStudy,
-    "Simulate days of many cars that search a lot; compare lots and kinds of information.",
-    "`agents`, `scenarios`, `knows`, `shares`, `arrivals_per_hour`, `days`",
-)
-curve = _verb(
-    CurveStudy,
-    "Fit search time, walk and more in a town as functions of occupancy and demand; see `load_curves`.",
-    "`scenarios`, `arrivals_per_hour`, `days`, `reach_m`",
-)
-survey = _verb(
-    SurveyStudy,
-    "Drive past every slot with simulated sensors; the result's folder holds the map, `map.sqlite`.",
-    "`scenario`, `sessions`, `rig`, `detector`, `every`",
-)
-train = _verb(
-    TrainingSpec,
-    "Train agents by reinforcement learning, one model per seed, and test them; the folder holds the models.",
-    "`algorithm`, `scenarios`, `steps`, `trainings`, `seed`",
-)
+compare = verb(Comparison)
+fleet = verb(FleetStudy)
+curve = verb(CurveStudy)
+survey = verb(SurveyStudy)
+train = verb(TrainingSpec)

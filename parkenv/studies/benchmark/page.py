@@ -13,9 +13,10 @@ from scipy.special import ndtri
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
+from parkenv.show.columns import Column, shared
 from parkenv.show.report.page import Page, page_data
-from parkenv.show.report.tables import Column, table_of
-from parkenv.studies.benchmark.study import RESULT
+from parkenv.show.report.tables import table_of
+from parkenv.studies.benchmark.study import RESULT, Benchmark
 from parkenv.studies.benchmark.suite import Suite, mean_time, score_interval
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of
@@ -148,13 +149,15 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
         {"agent": ", ".join(result["episodes"]), "command": shlex.join(result["command"])} | _origin(result)
         for result in results
     ]
-    in_tasks = {task.name: Column(task.name, task.name, "s", help=_TIMES) for task in suite.tasks}
+    in_tasks = [Column(task.name, task.name, "s", help=_TIMES) for task in suite.tasks]
     tables = [
-        table_of("scores", "Ranking", ranking(suite, entries), columns=_COLUMNS),
-        table_of("times", "Mean total time in each task", times, columns=in_tasks),
-        table_of("pairs", "How many searches tell neighbours apart", pairs, columns=_COLUMNS),
-        table_of("commands", "How the results were made", made, columns=_COLUMNS),
-        table_of("tasks", "Every task", [row for result in results for row in result["rows"]]),
+        table_of("scores", "Ranking", ranking(suite, entries), _COLUMNS),
+        table_of("times", "Mean total time in each task", times, in_tasks),
+        table_of("pairs", "How many searches tell neighbours apart", pairs, _COLUMNS),
+        table_of("commands", "How the results were made", made, _COLUMNS),
+        table_of(
+            "tasks", "Every task", [row for result in results for row in result["rows"]], Benchmark.columns
+        ),
     ]
     summary = {"command": command, "version": __version__, "seed": None}
     return page_data("benchmark", Page(f"Benchmark suite {suite.name}", findings, tables), summary)
@@ -163,15 +166,16 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
 _TIMES = "Mean total time, 95 % interval"
 _SCORE = "Mean time of the clairvoyant bound over the agent's; 95 % interval"
 _BEHIND = "Mean time minus that of the best, or of the second agent, in the same worlds; 95 % interval"
-_COLUMNS = {
-    column.key: column
-    for column in (
-        Column("score", "score", share=True, help=_SCORE),
-        Column("mean_s", "mean time", "s", help="Over the tasks, each with the same weight; 95 % interval"),
-        Column("behind_s", "behind", "s", 2, signed=True, help=_BEHIND),
-        Column("searches", "searches", digits=0),
-        Column("error", "standard error", "s", 2),
-        Column("searches_for_1_s", "searches for ±1 s", digits=0, help="At 95 %"),
-        *_WHO,
-    )
-}
+_COLUMNS = (
+    *shared("agent"),
+    Column("agents", "agents"),
+    Column("score", "score", share=True, help=_SCORE),
+    Column("mean_s", "mean time", "s", help="Over the tasks, each with the same weight; 95 % interval"),
+    Column("behind_s", "behind", "s", 2, signed=True, help=_BEHIND),
+    *shared("decision_ms"),
+    Column("searches", "searches", digits=0),
+    Column("error", "standard error", "s", 2),
+    Column("searches_for_1_s", "searches for ±1 s", digits=0, help="At 95 %"),
+    Column("command", "command"),
+    *_WHO,
+)

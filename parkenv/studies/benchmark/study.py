@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from parkenv.files.limited_reading import read_json
 from parkenv.files.option import option
+from parkenv.show.columns import Column, shared
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import CaseStudy
 from parkenv.studies.fields import Agents
@@ -22,8 +26,38 @@ RESULT = "result.json"
 AGENTS = ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
 
 
+def score_table(results: Sequence[Row]) -> Row:
+    """Return the table of the scores of results, the best first."""
+    from parkenv.show.report.tables import spread, table_of
+
+    rows = [
+        {**row, "score": result["scores"][row["agent"]]}
+        for result in results
+        for row in spread(result["rows"], ("agent",), "task", "total_s")
+    ]
+    rows.sort(key=lambda row: -row["score"])
+    names = dict.fromkeys(key for row in rows for key in row if key not in ("agent", "score"))
+    columns = (*shared("agent"), *(Column(name, name) for name in names), Benchmark.columns[-1])
+    return table_of("scores", "Mean total time, s, and the score", rows, columns)
+
+
 class Benchmark(CaseStudy):
-    """A run of the benchmark suite, which defines scenarios, costs, speeds and seeds."""
+    """The suite defines scenarios, costs, speeds and seeds.
+
+    An agent's score in a task is the mean total time of the clairvoyant bound divided by the agent's own; its score in
+    the suite is the mean over the tasks, at most 1.
+    """
+
+    columns: ClassVar = (
+        Column("task", "task", setting=True),
+        *shared("agent"),
+        Column("score", "score", share=True, help="Mean time of the clairvoyant bound over the agent's"),
+    )
+    writes: ClassVar = "result.json and the episodes"
+    examples: ClassVar = """
+        parkenv benchmark run v3 --agents belief,mdp --out results/v3
+        parkenv benchmark check results/v3/result.json
+        """
 
     kind: Literal["benchmark"] = "benchmark"
     suite: Literal["v3"] = option("v3", "The suite.", name="SUITE", argument=True)
@@ -69,6 +103,15 @@ class Benchmark(CaseStudy):
         from parkenv.studies.benchmark.result_file import score_rows
 
         return {"rows": score_rows(self.made_suite, self.cells(), results.rows(self.table))}
+
+    @classmethod
+    def printed(cls, summary: Row, folder: Path) -> list[Row]:
+        """See `Study`: the scores of a finished suite."""
+        return [score_table([read_json(folder / RESULT)])] if summary["complete"] else []
+
+    @classmethod
+    def folder(cls, given: Mapping[str, Any]) -> Path:
+        return Path("results") / str(given.get("SUITE", "v3"))
 
     def outputs(self, result: Result) -> list[Task[object]]:
         """See `Study`: the result file."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -15,6 +16,7 @@ from parkenv.files.known_names import MapName
 from parkenv.files.option import option
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.show.columns import Column, shared
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import (
     Agents,
@@ -39,7 +41,15 @@ PICTURE = "commute.png"
 
 
 class Commute(Study):
-    """Drivers who come day after day, with a map that learns from their trips."""
+    """Each driver comes at the same time of day, on the next of the scenario's weekdays or recorded days.
+
+    In the evening, the observations of the search update the driver's map, with the sensor's error rates, and correct
+    the next day's forecast. The map gets no other data.
+
+    The table and the figure show mean total time and forecast error (Brier score of P(taken) at the arrival, over all
+    slots) against the day. For comparison, each agent also drives with the right map without learning (fixed); agents
+    without a map (first-free, greedy-drive, ...) have one level. All run in the same worlds.
+    """
 
     table: ClassVar = Table(
         "episodes.csv",
@@ -51,6 +61,28 @@ class Commute(Study):
     unit: ClassVar = "searches"
     heading: ClassVar = "Maps that learn from every trip"
     table_titles: ClassVar = {"rows": "Results", "weeks": "By five days"}
+    columns: ClassVar = (
+        *shared("scenario"),
+        Column(
+            "map",
+            "map at first",
+            help="fixed: right, does not learn; none: the agent uses no map",
+            setting=True,
+        ),
+        *shared("agent", "total_s", "difference_s"),
+        Column("day", "day", digits=0),
+        Column("days", "days", setting=True),
+        Column("courses", "drivers", digits=0),
+        Column("forecast_error", "forecast error", digits=3, help="Brier score of P(taken) at the arrival"),
+    )
+    writes: ClassVar = "experiment.json, episodes.csv, summary.json, commute.png and the maps"
+    examples: ClassVar = """
+        parkenv commute --scenario jam --map wrong
+        parkenv commute --scenario campus,jam --map empty,wrong --days 20
+        parkenv commute --agents belief,first-free --drivers 100
+        parkenv commute --fleet 5 --map empty
+        parkenv commute --resume --days 60
+        """
 
     kind: Literal["commute"] = "commute"
     agents: Agents = Field(
@@ -182,6 +214,23 @@ class Commute(Study):
 
         episodes = [row for cell in self.cells() for row in results.of(self, cell)]
         return {"rows": day_rows(episodes), "weeks": week_rows(episodes)}
+
+    @classmethod
+    def printed(cls, summary: Row, folder: Path) -> list[Row]:
+        """See `Study`: mean total times and forecast errors of each five days."""
+        from parkenv.show.report.tables import spread, table_of
+
+        del folder
+        weeks, names = summary["weeks"], ("scenario", "map", "agent")
+        days = dict.fromkeys(row["days"] for row in weeks)
+        return [
+            table_of("weeks", title, spread(weeks, names, "days", measure), columns)
+            for title, measure, digits in (
+                ("Mean total time, s, by days", "total_s", 1),
+                ("Forecast error by days", "forecast_error", 3),
+            )
+            for columns in [(*cls.columns, *(Column(day, f"days {day}", digits=digits) for day in days))]
+        ]
 
     def outputs(self, result: Result) -> list[Task[object]]:
         from parkenv.show.figures.commute import save_commute_curves

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -15,7 +15,8 @@ from parkenv.files.known_names import UNBEATEN
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, Spec
 from parkenv.scenarios.spec import Cost, Probability, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
-from parkenv.show.columns import SETTING_AXES
+from parkenv.show.columns import SETTING_AXES, Column, shared
+from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
     AGENTS_HELP,
@@ -35,18 +36,24 @@ from parkenv.studies.fields import (
 from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
+from parkenv.world.cost_terms import COST_FIELDS
 from planners.names import BOUND, HUMAN
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.compare.cases import Case
-    from parkenv.studies.report import Replay
+    from parkenv.studies.report import ReplayJob
+    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 DEFAULT_AGENTS = (
     "mdp", "belief", "mdp-tuned", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
 )  # fmt: skip
+LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
+"""Occupancy levels of the command."""
+MOST_SETTINGS = 12
+"""Settings up to which the terminal shows all columns."""
 FAILURE_COST_SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
 """Failure costs of `--failure-cost sweep`, s."""
 NEEDS_OBSERVATIONS = ("belief", "belief-rivals", "mdp-tuned", "exact", "network")
@@ -130,23 +137,45 @@ class Grid(Spec):
 class CaseStudy(Study):
     """A study whose cells are cases: an agent in a scenario, with the seeds of its searches."""
 
+    shown: ClassVar = {
+        "rows": (
+            "scenario", "blind", *SETTING_AXES, "agent", "episodes", "total_s", "median_s", "gave_up_fraction",
+            "difference_s", "regret_s", "gap_to_exact", "gap_to_bound", *COST_FIELDS, "parked_fraction", "replans",
+            "decision_ms", "decision_ms_p99",
+        )
+    }  # fmt: skip
+
     def run(self, work: Case, items: Sequence[int]) -> list[Row]:
         return work.run(items)
 
     def label(self, work: Case) -> str:
         return f"{work.label} in {work.scenario.name}"
 
-    def replays(self, folder: Path) -> Sequence[Replay]:
-        from parkenv.studies.compare.search_replay import SearchReplay
+    def replays(self, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
+        from parkenv.studies.compare.search_replay import search_replay
 
-        return [SearchReplay(_driven(self.cells()), folder)]
+        return [search_replay(_driven(self.cells()), folder, options)]
 
 
 class Comparison(CaseStudy):
-    """An experiment file: all agents search in the same worlds, in every scenario and setting."""
+    """Episode i has the same seed for every agent, hence the same cars at the same times.
+
+    The table gives the mean total time (drive + failed attempts + walk) with its 95 % interval, the paired difference
+    to the first agent, and the regret to the clairvoyant bound. Options are shortcuts for an experiment file for
+    `parkenv run`.
+    """
 
     heading: ClassVar = "Agents compared"
     table_titles: ClassVar = {"rows": "Results", "occupancy_rows": "By occupancy level"}
+    writes: ClassVar = "experiment.json, episodes.csv, summary.json and the figures"
+    examples: ClassVar = """
+        parkenv compare --scenario campus,jam --failure-cost 10,90 --out results
+        parkenv compare --agents "mdp(failure_s=90),belief,oracle" --report
+        parkenv compare --agents mdp,mdp-tuned,oracle --failure-cost sweep
+        parkenv compare --scenario lots --largest 5 --report
+        parkenv compare --lot lot.geojson --occupancy log.csv.gz -n 300
+        parkenv compare --resume --episodes 1000
+        """
 
     kind: Literal["compare"] = "compare"
     agents: Annotated[
@@ -243,6 +272,15 @@ class Comparison(CaseStudy):
     def seeds(self) -> range:
         """Seeds of the episodes."""
         return range(self.seed, self.seed + self.episodes)
+
+    def with_options(self, given: Mapping[str, Any], *, resumed: bool) -> Self:
+        """See `Study`; a sweep of failure costs has no occupancy levels by default, and also blind searches."""
+        grid, sweep = self.grid, given.get("--failure-cost") == "sweep"
+        if "--occupancy-levels" not in given and not resumed:
+            grid = grid.changed(occupancy_levels=() if sweep else LEVELS)
+        if sweep or "--failure-cost" in given:
+            grid = grid.changed(blind=sweep)
+        return self.changed(grid=grid)
 
     def check(self) -> None:
         from parkenv.studies.compare.cases import BUDGET, check_worlds, require_distinct
@@ -380,21 +418,40 @@ class Comparison(CaseStudy):
         return [partial(draw_figures, data, result.folder)]
 
     @classmethod
+    def printed(cls, summary: Row, folder: Path) -> list[Row]:
+        """See `Study`; of many settings, the mean total times alone."""
+        from parkenv.show.report.tables import spread, table_of
+
+        rows, names = summary["rows"], ("scenario", "v_walk_kmh", "v_drive_kmh", "agent")
+        if len({tuple(row[name] for name in ("scenario", *SETTING_AXES)) for row in rows}) <= MOST_SETTINGS:
+            return super().printed(summary, folder)
+        costs = sorted({row["failure_cost_s"] for row in rows})
+        columns = [Column(str(cost), f"{cost:g} s") for cost in costs]
+        by_cost = spread(rows, names, "failure_cost_s", "total_s")
+        return [
+            table_of("costs", "Mean total time, s, by failure cost", by_cost, (*shared(*names), *columns))
+        ]
+
+    @classmethod
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: the agents that none beats in the first setting; the table marks those of all."""
+        from parkenv.world.scenario import KMH
 
         def setting(row: Row) -> tuple[Any, ...]:
             return row["scenario"], *(row[name] for name in SETTING_AXES)
 
         first, *_ = rows = summary["rows"]
         agents = [row for row in rows if setting(row) == setting(first) and row["agent"] not in UNBEATEN]
-        if len(agents) < 2:
-            return []
         leaders = ", ".join(f"{row['agent']} ({row['total_s']:.1f} s)" for row in agents if row["leads"])
-        return [
-            f"On {first['scenario']}, failure cost {first['failure_cost_s']:g} s, no agent is clearly faster than "
-            f"{leaders}."
-        ]
+        where = f"On {first['scenario']}, failure cost {first['failure_cost_s']:g} s"
+        findings = [f"{where}, no agent is clearly faster than {leaders}."] if len(agents) > 1 else []
+        if (measured := summary.get("calibrated")) is not None:
+            findings.append(
+                f"Calibrated over {plural(measured['trips'], 'trip')}: failure cost {measured['failure_s']:.4g} s, "
+                f"drive {measured['v_drive'] / KMH:.4g} km/h. Parking takes {measured['manoeuvre_s']:.1f} s more for "
+                "the manoeuvre into the slot, under either cost; the tables leave that out."
+            )
+        return findings
 
 
 def _driven(cells: Sequence[Cell]) -> list[Cell]:

@@ -39,45 +39,40 @@ class Encounter(NamedTuple):
     seed: int
 
 
-class SearchReplay(NamedTuple):
-    """The searches of a run.
+def search_replay(
+    cases: Sequence[tuple[Case, Sequence[int]]], folder: Path, options: ReportOptions
+) -> ReplayJob:
+    """Return the searches to run again; lots with too many slots are left out.
 
-    Attributes:
+    Args:
         cases: cases, each with the seeds of its searches.
         folder: folder of the run; totals are compared with those in `episodes.csv`, if it is there.
+        options: which searches.
     """
-
-    cases: Sequence[tuple[Case, Sequence[int]]]
-    folder: Path
-
-    def again(self, options: ReportOptions) -> ReplayJob:
-        """See `Replay`; lots with too many slots are left out."""
-        agents = options.chosen_agents([case.label for case, _ in self.cases])
-        cases = [(case, seeds) for case, seeds in self.cases if case.label in agents]
-        wanted = options.chosen_numbers(cases[0][1] if cases else ())
-        lots = {case.scenario.name: case.scenario.lot.n_slots for case, _ in cases}
-        notes = [
-            f"{name} has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"
-            for name, n in lots.items()
-            if n > MOST_SLOTS
-        ]
-        drawn = [
-            (case, seeds if wanted is None else wanted)
-            for case, seeds in cases
-            if case.scenario.lot.n_slots <= MOST_SLOTS
-        ]
-        count = options.episodes
-        if count is None:
-            count = SENSED if any(case.rig is not None for case, _ in self.cases) else SEARCHES
-        encounters = choose(drawn, count) if count else []
-        totals = (
-            {EPISODES.key(row): row["total_s"] for row in EPISODES.read(self.folder)} if encounters else {}
-        )
-        tasks = []
-        for encounter in encounters:
-            keys = [case.key(encounter.seed) for case in encounter.cases]
-            tasks.append(partial(replay, encounter, {key: totals[key] for key in keys if key in totals}))
-        return ReplayJob(tasks, notes)
+    agents = options.chosen_agents([case.label for case, _ in cases])
+    count = options.episodes
+    if count is None:
+        count = SENSED if any(case.rig is not None for case, _ in cases) else SEARCHES
+    cases = [(case, seeds) for case, seeds in cases if case.label in agents]
+    wanted = options.chosen_numbers(cases[0][1] if cases else ())
+    lots = {case.scenario.name: case.scenario.lot.n_slots for case, _ in cases}
+    notes = [
+        f"{name} has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"
+        for name, n in lots.items()
+        if n > MOST_SLOTS
+    ]
+    drawn = [
+        (case, seeds if wanted is None else wanted)
+        for case, seeds in cases
+        if case.scenario.lot.n_slots <= MOST_SLOTS
+    ]
+    encounters = choose(drawn, count) if count else []
+    totals = {EPISODES.key(row): row["total_s"] for row in EPISODES.read(folder)} if encounters else {}
+    tasks = []
+    for encounter in encounters:
+        keys = [case.key(encounter.seed) for case in encounter.cases]
+        tasks.append(partial(replay, encounter, {key: totals[key] for key in keys if key in totals}))
+    return ReplayJob(tasks, notes)
 
 
 def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[Encounter]:

@@ -19,7 +19,7 @@ from scipy.sparse import csr_matrix, vstack
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import with_extra
-from parkenv.show.report.tables import Column
+from parkenv.show.columns import Column
 from parkenv.studies.curve.zones import INDEX, LONE, OF_CARS, STATE, SUMS, Zones
 from parkenv.studies.results import Row
 from parkenv.studies.workers import SERIAL, Workers

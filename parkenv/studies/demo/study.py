@@ -15,7 +15,7 @@ from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.compare.comparison import CaseStudy, Comparison
 from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, OneScenario, Seed
-from parkenv.studies.results import EPISODES, Results, Row, Table, without_nan
+from parkenv.studies.results import EPISODES, Results, Row, Table
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
 from parkenv.studies.study import Cell, Stage, run_tasks
@@ -25,8 +25,8 @@ from parkenv.version import __version__
 if TYPE_CHECKING:
     from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SessionResult, SurveySettings
-    from parkenv.show.report.page import Page
-    from parkenv.studies.report import Replay
+    from parkenv.studies.report import ReplayJob
+    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
@@ -57,12 +57,26 @@ class _RecordedSurvey(SurveyStudy):
 
 
 class Demo(CaseStudy):
-    """A survey, and searches on other days with its map."""
+    """1. Survey: a car with a side camera and a laser passes every slot; parked cars are detected, located and mapped.
+
+    2. Map: the probability that each slot is taken at the hour of the search, from these sessions only.
+
+    3. Searches on other days, with camera, laser and detector: the thesis's planner, the planner in belief space and
+    two heuristic baselines, all with the same map, in the same worlds; and an oracle that knows every slot's future.
+    Many more searches follow without images, with the error rates of the sensors: enough to separate the agents.
+
+    4. A report with replays, and a film of one search.
+    """
 
     block: ClassVar = 1
     heading: ClassVar = "From a survey to a search"
     table_titles: ClassVar = {"rows": "Searches with simulated sensors"}
     further_tables: ClassVar[tuple[Table, ...]] = (SESSIONS,)
+    writes: ClassVar = "everything"
+    examples: ClassVar = """
+        parkenv demo
+        parkenv demo --quick --out results/quick
+        """
 
     kind: Literal["demo"] = "demo"
     scenario: Annotated[OneScenario, Inside(only=())] = scenario_spec("campus")
@@ -199,17 +213,14 @@ class Demo(CaseStudy):
         return [*SurveyStudy.findings({"rows": [summary["survey"]]}), *Comparison.findings(summary)]
 
     @classmethod
-    def page(cls, summary: Row, folder: Path) -> Page:
-        from parkenv.show.report.tables import survey_tables
+    def page_tables(cls, summary: Row, folder: Path) -> list[Row]:
+        surveyed = SurveyStudy.page_tables({"rows": [summary["survey"]]}, folder)
+        return [*super().page_tables(summary, folder), *surveyed]
 
-        page = super().page(summary, folder)
-        surveyed = survey_tables(summary["survey"], without_nan(SESSIONS.read(folder)))
-        return page._replace(tables=[*page.tables, *surveyed])
+    def replays(self, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
+        from parkenv.studies.compare.search_replay import search_replay
 
-    def replays(self, folder: Path) -> Sequence[Replay]:
-        from parkenv.studies.compare.search_replay import SearchReplay
-
-        return [SearchReplay(self.cases_in(folder), folder), *self.survey.replays(folder)]
+        return [search_replay(self.cases_in(folder), folder, options), *self.survey.replays(folder, options)]
 
 
 def _short_survey(settings: SurveySettings) -> None:

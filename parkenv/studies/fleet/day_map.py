@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, TABLES, Blocks, b
 from parkenv.studies.fleet.day import ALL
 from parkenv.studies.fleet.setting import Setting
 from parkenv.studies.report import Recording, ReplayJob
-from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Row, without_nan
 from parkenv.world.scenario import Scenario
 from parkenv.world.tariff import PUBLIC, Zone
@@ -34,22 +33,10 @@ Rows = Mapping[str, Sequence[Row]]
 """Rows of each of `TABLES`, by its file."""
 
 
-class DayMaps(NamedTuple):
-    """The maps of a study of many cars.
-
-    Attributes:
-        study: the study.
-        folder: folder of the run.
-    """
-
-    study: FleetStudy
-    folder: Path
-
-    def again(self, options: ReportOptions) -> ReplayJob:
-        """See `Replay`: nothing runs again, the maps are in the tables of the run."""
-        del options
-        rows = {table.file: table.read(self.folder) for table in TABLES}
-        return ReplayJob([partial(dict, recording) for recording in map_recordings(self.study, rows)])
+def map_replay(study: FleetStudy, folder: Path) -> ReplayJob:
+    """Return the maps of a run, which are in its tables: nothing runs again."""
+    rows = {table.file: table.read(folder) for table in TABLES}
+    return ReplayJob([partial(dict, recording) for recording in map_recordings(study, rows)])
 
 
 def write_map_page(study: FleetStudy, summary: Row, rows: Rows, folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,40 +33,34 @@ DAYS = 8
 """Default number of replayed days."""
 
 
-class FleetReplay(NamedTuple):
-    """The days of a study of many cars.
+def day_replay(study: FleetStudy, folder: Path, options: ReportOptions) -> ReplayJob:
+    """Return the days to run again; lots with too many slots or counted ones, and crowded days, are left out.
 
-    Attributes:
+    Args:
         study: the study.
         folder: folder of the run; means are compared with those in `days.csv`.
+        options: which days.
     """
-
-    study: FleetStudy
-    folder: Path
-
-    def again(self, options: ReportOptions) -> ReplayJob:
-        """See `Replay`; lots with too many slots or counted ones, and days with too many cars, are left out."""
-        study = self.study
-        agents = options.chosen_agents([setting.agent.label for setting in study.fleet_settings])
-        numbers = options.chosen_numbers(range(study.days))
-        if (n := max(scenario.lot.n_slots for scenario in study.built.values())) > MOST_SLOTS:
-            return ReplayJob(
-                notes=[f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
-            )
-        if any((scenario.lot.capacity > 1).any() for scenario in study.built.values()):
-            return ReplayJob(notes=["counted facilities have no slots to draw: no replay; the map has them"])
-        settings = [one for one in study.fleet_settings if one.agent.label in agents]
-        rows = study.table.read(self.folder)
-        crowded = {row["arrivals_per_hour"] for row in rows if row["cars"] > MOST_CARS}
-        rates = [rate for rate in study.demands if rate in crowded]
-        notes = [
-            f"days with {rate_text(rate)} have more than the {MOST_CARS} cars that are drawn: no replay"
-            for rate in rates
-        ]
-        settings = [one for one in settings if one.arrivals_per_hour not in rates]
-        chosen = choose_days(study, settings, DAYS if options.episodes is None else options.episodes, numbers)
-        totals = {study.table.key(row): row["total_s"] for row in rows}
-        return ReplayJob([partial(record_day, study, setting, day, totals) for setting, day in chosen], notes)
+    agents = options.chosen_agents([setting.agent.label for setting in study.fleet_settings])
+    numbers = options.chosen_numbers(range(study.days))
+    if (n := max(scenario.lot.n_slots for scenario in study.built.values())) > MOST_SLOTS:
+        return ReplayJob(
+            notes=[f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
+        )
+    if any((scenario.lot.capacity > 1).any() for scenario in study.built.values()):
+        return ReplayJob(notes=["counted facilities have no slots to draw: no replay; the map has them"])
+    settings = [one for one in study.fleet_settings if one.agent.label in agents]
+    rows = study.table.read(folder)
+    crowded = {row["arrivals_per_hour"] for row in rows if row["cars"] > MOST_CARS}
+    rates = [rate for rate in study.demands if rate in crowded]
+    notes = [
+        f"days with {rate_text(rate)} have more than the {MOST_CARS} cars that are drawn: no replay"
+        for rate in rates
+    ]
+    settings = [one for one in settings if one.arrivals_per_hour not in rates]
+    chosen = choose_days(study, settings, DAYS if options.episodes is None else options.episodes, numbers)
+    totals = {study.table.key(row): row["total_s"] for row in rows}
+    return ReplayJob([partial(record_day, study, setting, day, totals) for setting, day in chosen], notes)
 
 
 def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[Key, float]) -> Recording:

@@ -17,6 +17,8 @@ from parkenv.files.option import option
 from parkenv.files.spec_file import FilePath
 from parkenv.scenarios.purposes import PurposeSpec
 from parkenv.scenarios.spec import Date, scenario_spec
+from parkenv.show.columns import Column
+from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
 from parkenv.studies.results import Results, Row, Table
@@ -33,6 +35,19 @@ if TYPE_CHECKING:
 
 PREDICTIONS = ("simulated", "forecast", "last_week", "mean_followed")
 """Predictions of the counts."""
+COLUMNS = (
+    Column("car_park", "car park"),
+    Column("capacity", "places", digits=0),
+    Column("arrivals_a_day", "cars a day", digits=0),
+    Column("stay_h", "stay", "h"),
+    Column("days_held_out", "days", digits=0),
+    Column("counted", "counted", share=True, digits=0),
+    Column("simulated", "simulated", share=True, digits=0),
+    Column("fit_error", "error, fit", share=True),
+    *(Column(f"{name}_error", f"error, {name.replace('_', ' ')}", share=True) for name in PREDICTIONS),
+)
+FAR_OFF = 0.15
+"""Mean difference from the counts, share of the places, above which a car park is said not to be followed."""
 KINDS: dict[str, tuple[int, ...]] = {"scenario": (0, 1, 2, 3, 4), "saturday": (5,), "sunday": (6,)}
 """Weekdays (Monday = 0) that have a demand of their own, by the name of its scenario file."""
 
@@ -78,6 +93,16 @@ class DemandStudy(Study):
     doing: ClassVar = "Driving days held out"
     unit: ClassVar = ""
     heading: ClassVar = "Demand as counted"
+    columns: ClassVar = COLUMNS
+    shown: ClassVar = {"rows": [column.key for column in COLUMNS]}
+    writes: ClassVar = (
+        "scenario.json, saturday.json, sunday.json, summary.json, predicted.csv, demand.png, and finished work: "
+        "fitted.jsonl and days.jsonl"
+    )
+    examples: ClassVar = """
+        parkenv occupancy demand counts.csv.gz --scenario town.toml --from 2021-09-06
+        parkenv fleet --scenario results/demand/scenario.json
+        """
 
     kind: Literal["demand"] = "demand"
     counts: FilePath | None = option(
@@ -224,6 +249,17 @@ class DemandStudy(Study):
             "map_rank_correlation": None if correlation is None else float(correlation),
             "not_in_lot": town.others,
         }
+
+    @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        off = [row["car_park"] for row in summary["rows"] if row["simulated_error"] > FAR_OFF]
+        findings = [
+            f"{plural(summary['days_held_out'], 'day')} held out; error {summary['simulated_error']:.1%}."
+        ]
+        findings += [f"Not followed: {', '.join(off)}."] if off else []
+        return findings + (
+            [f"Not in the lot: {', '.join(summary['not_in_lot'])}."] if summary["not_in_lot"] else []
+        )
 
     def _held_out(self, results: Results) -> HeldOutErrors:
         town, rows, fits = self.town, results.rows(DAYS), results.rows(FITTED)

@@ -7,15 +7,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from parkenv.studies.fleet.columns import COLUMNS, SHOWN
 from parkenv.studies.fleet.setting import OWN, Setting, rate_text
 from parkenv.studies.fleet.spec import OPTIONS, FleetSpec
 from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
-    from parkenv.show.report.page import Page
     from parkenv.studies.fleet.day import Day
-    from parkenv.studies.report import Replay
+    from parkenv.studies.report import ReplayJob
+    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
 
 PICTURE = "fleet.png"
@@ -23,7 +24,16 @@ MOST_BLOCKS = 60  # rows of blocks up to which the page has a table of them
 
 
 class FleetStudy(FleetSpec):
-    """Days on which many cars search a lot: what they know, and what changes with the lot."""
+    """On a day, residents are parked when the hours of arrival begin, and leave after the rest of their stay.
+
+    Cars arrive as a Poisson process. All settings have the same days: arrivals, stays, patience and residents. The
+    table gives the mean over cars and days with 95 % intervals over days. The price of anarchy is the total time
+    divided by that of a guidance system that reserves slots for all cars; it needs reserve in --knows, and 1 in
+    --share.
+
+    Several scenarios, for example a lot before and after a change, are compared with the first one: the same cars
+    arrive on the same days. The second table lists the changes by group of cars, for guidance as for scenarios.
+    """
 
     heading: ClassVar = "Many cars"
     table_titles: ClassVar = {
@@ -34,6 +44,19 @@ class FleetStudy(FleetSpec):
         "blocks": "Blocks, a day",
         "hours": "Occupancy by hour, simulated and as counted",
     }
+
+    columns: ClassVar = COLUMNS
+    shown: ClassVar = SHOWN
+    writes: ClassVar = "days.csv, blocks.csv, lanes.csv, hours.csv, summary.json, fleet.html and figures"
+    examples: ClassVar = """
+        parkenv fleet --scenario campus --arrivals-per-hour 60,120 --out crowd
+        parkenv fleet --agents belief,greedy-drive --knows own,reserve -n 5
+        parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
+        parkenv fleet --scenario old.geojson,new.geojson --hours 08:00-12:00 --report
+        parkenv fleet --lot zones.geojson --price centre=2/h --value-of-time 12/h
+        parkenv fleet --manoeuvre 15 --leaving-soon 10
+        parkenv fleet --resume --episodes 20
+        """
 
     kind: Literal["fleet"] = "fleet"
 
@@ -126,17 +149,13 @@ class FleetStudy(FleetSpec):
         return [finding, *(f"On {name}, {caution}" for name, caution in summary["cautions"].items())]
 
     @classmethod
-    def page(cls, summary: Row, folder: Path) -> Page:
-        """See `Study`; some columns mean something else than in other tables."""
-        from parkenv.show.report.tables import OF_FLEETS, tables_of
-
-        # Of a town with many streets the map tells, and blocks.csv.
+    def page_tables(cls, summary: Row, folder: Path) -> list[Row]:
+        """See `Study`; of a town with many streets the map tells, and blocks.csv."""
         blocks = summary["blocks"] if len(summary["blocks"]) <= MOST_BLOCKS else []
-        tables = tables_of({**summary, "blocks": blocks}, cls.table_titles, OF_FLEETS)
-        return super().page(summary, folder)._replace(tables=tables)
+        return super().page_tables({**summary, "blocks": blocks}, folder)
 
-    def replays(self, folder: Path) -> Sequence[Replay]:
-        from parkenv.studies.fleet.day_map import DayMaps
-        from parkenv.studies.fleet.day_replay import FleetReplay
+    def replays(self, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
+        from parkenv.studies.fleet.day_map import map_replay
+        from parkenv.studies.fleet.day_replay import day_replay
 
-        return [DayMaps(self, folder), FleetReplay(self, folder)]
+        return [map_replay(self, folder), day_replay(self, folder, options)]

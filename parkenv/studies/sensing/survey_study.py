@@ -13,6 +13,7 @@ from parkenv.files.known_names import LocaliserName, RigName, WeatherName
 from parkenv.files.option import Inside, option
 from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import Hours, scenario_spec
+from parkenv.show.columns import Column, shared
 from parkenv.show.plurals import plural, slots_text
 from parkenv.studies.fields import PRICES, CaptureDistance, Detector, OneScenario, Seed, with_traffic
 from parkenv.studies.results import SETTINGS, Key, Results, Row, without_nan
@@ -22,8 +23,8 @@ from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
-    from parkenv.show.report.page import Page
-    from parkenv.studies.report import Replay
+    from parkenv.studies.report import ReplayJob
+    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
@@ -35,14 +36,84 @@ SHOWN = "shown"
 """Key of the first session in `Results.kept`: its result, with perception results for figures, and its recording."""
 
 
+_METHODS = (
+    ("fitted", "rectangle fitted to the beams"), ("thesis", "middle of the beams, as in the thesis")
+)  # fmt: skip
+_CAR_ERRORS = (
+    Column("range_error_m", "distance, median error", "m", 3),
+    Column("range_error_p95_m", "distance, 95th percentile", "m", 2),
+    Column("place_error_m", "position, median error", "m", 2),
+    Column("heading_error_deg", "heading, median error", "°", 1),
+)
+COLUMNS = (
+    *shared("scenario"),
+    Column("key", "drive"),
+    Column("rig", "rig"),
+    Column("detector", "detector"),
+    Column("weather", "weather"),
+    Column("distance_m", "distance", "m", 0),
+    Column("in_frame", "cars in frames", digits=0),
+    Column("detected", "detected", digits=0),
+    Column("rate", "share detected", share=True, help="In frames in which the car is not occluded"),
+    Column("occupied_fraction", "slots taken", share=True, digits=0),
+    Column("parked", "parked", digits=0),
+    Column("found", "found", digits=0),
+    Column("detections", "detections", digits=0),
+    Column("right", "correct", digits=0),
+    Column("sessions", "drives", digits=0),
+    Column("slots", "slots", digits=0),
+    Column("car_detection_rate", "parked cars found", share=True, help="Detected at least once"),
+    Column("detection_precision", "detections that are cars", share=True),
+    Column("range_abs_error_m.median", "distance of a car, median error", "m", 3),
+    Column("range_abs_error_m.p95", "distance of a car, 95th percentile", "m", 2),
+    *(
+        column._replace(key=f"car_pose.{key}.{column.key}", label=f"{name}: {column.label}")
+        for key, name in _METHODS
+        for column in _CAR_ERRORS
+    ),
+    Column("localise", "localisation"),
+    Column("pose_error_m.odometry", "position by odometry, error", "m", 2, help="Root mean square, of a drive"),
+    Column("pose_error_m.estimated", "position as estimated, error", "m", 2),
+    Column("pose_error_m.max", "position as estimated, greatest error", "m", 2),
+    Column("slot_accuracy", "slot accuracy", share=True, help="Slots never in view count as wrong"),
+    Column("slot_accuracy_seen", "slot accuracy, slots in view", share=True),
+    Column("unknown_fraction", "slots never in view", share=True),
+    *_CAR_ERRORS,
+    Column("slots_found.precision", "discovered slots, precision", share=True),
+    Column("slots_found.recall", "discovered slots, recall", share=True),
+    Column("slots_found.error", "discovered slots, mean position error", "m", 2),
+    Column("slots_found.yaw_error", "discovered slots, mean heading error", "rad", 3),
+    Column("occupancy_mae", "map error", digits=3, help="Mean absolute error of P(taken)"),
+    Column("occupancy_mae_expected", "map error of raw counts", digits=3, help="Of as many drives at that hour"),
+    Column("seconds_per_frame", "perception time per frame", "s", 3),
+)  # fmt: skip
+SHOWN_OF_SESSIONS = (
+    "key", "weather", "occupied_fraction", "parked", "found", "detections", "right", "slot_accuracy",
+    "slot_accuracy_seen", "unknown_fraction", "place_error_m", "heading_error_deg", "seconds_per_frame",
+)  # fmt: skip
+
+
 class SurveyStudy(Study):
-    """A survey: drives past every slot with simulated sensors, recorded in a map file."""
+    """Parked cars are detected in the camera images and located with the laser (or the stereo camera).
+
+    A Bayes filter estimates the state of each slot. Every drive is one session of the map. Sessions are added to the
+    map in --out: --resume adds further ones to it.
+    """
 
     table: ClassVar = SESSIONS
     block: ClassVar = 1
     doing: ClassVar = "Driving (compiles first after an installation)"
     unit: ClassVar = "sessions"
     heading: ClassVar = "Survey"
+    columns: ClassVar = COLUMNS
+    shown: ClassVar = {"survey": (), "by_weather": (), "detection_by_distance": ()}
+    writes: ClassVar = "map.sqlite, pictures and summary.json"
+    examples: ClassVar = """
+        parkenv survey --sessions 21
+        parkenv survey --scenario street --rig stereo --weather rain
+        parkenv survey --hours 12:00-13:00 --days weekend
+        parkenv survey --odometry-drift 0.02 --localise scan-matching
+        """
 
     kind: Literal["survey"] = "survey"
     scenario: Annotated[
@@ -209,13 +280,34 @@ class SurveyStudy(Study):
         ]
 
     @classmethod
-    def page(cls, summary: Row, folder: Path) -> Page:
-        from parkenv.show.report.tables import survey_tables
+    def page_tables(cls, summary: Row, folder: Path) -> list[Row]:
+        from parkenv.show.report.tables import table_of
 
-        tables = survey_tables(summary["rows"][0], without_nan(cls.table.read(folder)))
-        return super().page(summary, folder)._replace(tables=tables)
+        (surveyed,) = summary["rows"]
+        tables = [table_of("survey", "The survey", [surveyed], cls.columns, facts=True)]
+        for name, title, rows in (
+            ("by_weather", "By weather", [{"weather": w, **r} for w, r in surveyed["by_weather"].items()]),
+            ("detection_by_distance", "Detection rate by distance", surveyed["detection_by_distance"]),
+            (
+                "sessions",
+                "Survey drives",
+                [{c: row[c] for c in SHOWN_OF_SESSIONS} for row in SESSIONS.read(folder)],
+            ),
+        ):
+            if rows:
+                plain = [row | {"weather": row["weather"].replace("_", " ")} for row in without_nan(rows)]
+                tables.append(table_of(name, title, plain, cls.columns))
+        return tables
 
-    def replays(self, folder: Path) -> Sequence[Replay]:
-        from parkenv.studies.sensing.surveys import DriveReplay
+    def replays(self, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
+        from parkenv.studies.report import ReplayJob
 
-        return [DriveReplay(self.built, self.drive_settings, len(self.table.read(folder)))]
+        count = 0 if options.drives is not None else min(options.sessions, len(self.table.read(folder)))
+        frames = options.frames // max(count, 1)
+        return [ReplayJob([partial(_recorded, self.survey, number, frames) for number in range(count)])]
+
+
+def _recorded(survey: Survey, number: int, frames: int) -> Row:
+    from parkenv.show.report.drive_recording import record_drive
+
+    return record_drive(survey, number, most_frames=frames)[1]

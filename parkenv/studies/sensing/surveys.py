@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +15,9 @@ from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.distance_bins import DISTANCE_ENDS
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.store import MapStore
-from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
+from parkenv.mapping.survey import SessionResult, SurveySettings
 from parkenv.mapping.survey_score import METHODS
 from parkenv.show.plurals import plural
-from parkenv.studies.report import Recording, ReplayJob
-from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, MAP_FILE, SESSION_COLUMNS
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -187,27 +183,6 @@ def draw_survey(
             pictures.save_localisation(lot, shown, path("localised"))
         pictures.save_graph(lot, predicted, shown, path("graph"))
     pictures.save_found_slots(lot, found, score_discovery(found, lot), path("slots_found"))
-
-
-class DriveReplay(NamedTuple):
-    """The drives of a survey, driven again for a report."""
-
-    scenario: Scenario
-    settings: SurveySettings
-    sessions: int
-
-    def again(self, options: ReportOptions) -> ReplayJob:
-        numbers = range(min(options.sessions, self.sessions) if options.drives is None else 0)
-        frames = options.frames // max(len(numbers), 1)
-        return ReplayJob(
-            [partial(_driven_again, self.scenario, self.settings, number, frames) for number in numbers]
-        )
-
-
-def _driven_again(scenario: Scenario, settings: SurveySettings, number: int, frames: int) -> Recording:
-    from parkenv.show.report.drive_recording import record_drive
-
-    return record_drive(Survey(scenario, settings), number, most_frames=frames)[1]
 
 
 def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArray:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_json
 from parkenv.files.option import Inside, Option, option, words_in
-from parkenv.files.spec_file import Several
+from parkenv.files.spec_file import Several, require
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.show.columns import Column, shared
 from parkenv.studies.agent_spec import AgentItem, split_agents
 from parkenv.studies.fields import MAX_EPISODES, SCENARIOS_TAKE, Level, ScenarioList, Scenarios, Seed
 from parkenv.studies.results import PAGE, SUMMARY, Row, Table, without_nan
@@ -25,7 +25,8 @@ from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.show.report.page import Page
-    from parkenv.studies.report import Replay
+    from parkenv.studies.report import ReplayJob
+    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.results import Results
     from parkenv.studies.training.training import Training
 
@@ -57,7 +58,14 @@ class _Seeds(NamedTuple):
 
 
 class TrainingSpec(Study):
-    """Training to search by reinforcement learning, from what is near the car, of belief and forecast."""
+    """The reward of search agents is minus the time in seconds. They observe the surroundings of the car.
+
+    So they run on any lot. They are evaluated in held-out worlds; each seed's best model is kept, and tested at the
+    end. Hyperparameters are in parkenv/studies/training/configs.py.
+
+    With --resume, trainings continue from the checkpoints in --out; the models equal those of an uninterrupted
+    training. With more --steps, finished trainings continue, too.
+    """
 
     table: ClassVar = Table("trainings.csv", ("seed",), ("steps", "wall_s"))
     block: ClassVar = 1
@@ -68,6 +76,30 @@ class TrainingSpec(Study):
         "planners": "Planners in the same worlds",
     }
     unit: ClassVar = ""
+    columns: ClassVar = (
+        *shared("scenario"),
+        Column("test_scenario", "tested on", setting=True),
+        *shared("agent"),
+        Column("seed", "seed", digits=0),
+        *shared("total_s"),
+        Column("steps", "decisions in training", digits=0),
+        Column("steps_per_s", "decisions/s", digits=0),
+        Column("model", "model"),
+    )
+    shown: ClassVar = dict.fromkeys(
+        ("transfer", "planners"),
+        ("test_scenario", "scenario", "agent", "seed", "episodes", "total_s", "parked_fraction"),
+    )
+    writes: ClassVar = "models, curves and figures"
+    examples: ClassVar = """
+        parkenv train maskable-ppo --scenario campus
+        parkenv train maskable-ppo --scenario campus --steps 4000000 --resume
+        parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
+        parkenv train maskable-ppo --scenario lots --held-out 0.2 --curriculum size
+        parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
+        parkenv train ppo --beside results/maskable-ppo,results/dqn
+        parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
+        """
 
     kind: Literal["train"] = "train"
     algorithm: Literal["ppo", "maskable-ppo", "recurrent-ppo", "dqn"] = option(
@@ -154,11 +186,13 @@ class TrainingSpec(Study):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.held_out is not None and self.evaluate_on is not None:
-            raise PydanticCustomError("whole", "at most one of held_out, evaluate_on")
-        if self.demonstrations is not None and self.clone is None:
-            raise PydanticCustomError("whole", "demonstrations requires clone")
+        require(self.held_out is None or self.evaluate_on is None, "at most one of held_out, evaluate_on")
+        require(self.demonstrations is None or self.clone is not None, "demonstrations requires clone")
         return self
+
+    @classmethod
+    def folder(cls, given: Mapping[str, Any]) -> Path:
+        return Path("results") / str(given.get("ALGORITHM", cls.model_fields["algorithm"].default))
 
     @cached_property
     def training(self) -> Training:
@@ -188,6 +222,8 @@ class TrainingSpec(Study):
 
     def stages(self, results: Results) -> Iterator[Stage]:
         """See `Study`; shorter trainings go on, and the bars follow the curves that trainings write."""
+        if self.training.announcement:
+            results.progress(self.training.announcement, 1, 1)
         rows = results.rows(self.table).values()
         results.replace([row for row in rows if row["steps"] >= self.steps], self.table)
         seeds = self.cells()[0].items
@@ -245,5 +281,5 @@ class TrainingSpec(Study):
         title, panels = f"{listed(agents)} trained{on_scenarios(rows)}", learning_panels(summary, curves)
         return super().page(summary, folder)._replace(title=title, learning=panels)
 
-    def replays(self, folder: Path) -> Sequence[Replay]:
-        return self.training.replays(read_json(folder / SUMMARY), folder)
+    def replays(self, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
+        return self.training.replays(read_json(folder / SUMMARY), folder, options)

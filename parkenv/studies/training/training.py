@@ -36,9 +36,10 @@ from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, rows_of
-from parkenv.studies.compare.search_replay import SearchReplay
+from parkenv.studies.compare.search_replay import search_replay
 from parkenv.studies.fingerprints import fingerprints, flat_tables
-from parkenv.studies.report import Replay
+from parkenv.studies.report import ReplayJob
+from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import SETTINGS, Results, read_settings
 from parkenv.studies.simulate import charge_truncation
 from parkenv.studies.statistics import mean_interval
@@ -381,7 +382,7 @@ class Training:
             if (its := place_of == i).any()
         ]
 
-    def replays(self, summary: Row, folder: Path) -> Sequence[Replay]:
+    def replays(self, summary: Row, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
         """Return the tests of the best model and of the best planners; nothing without a test."""
         if not summary.get("transfer"):
             return ()
@@ -396,7 +397,7 @@ class Training:
             compared = (Case(scenario, agent.name, options=agent.options) for agent in self.compared)
             by_label = {case.label: case for case in compared}
             cases += [(by_label[row["agent"]], seeds) for row in beside if row["agent"] in by_label]
-        return [SearchReplay(cases, folder)]
+        return [search_replay(cases, folder, options)]
 
     @property
     def _title(self) -> str:

@@ -43,16 +43,23 @@ class _Trips(NamedTuple):
 
 
 class CalibrationStudy(Study):
-    """Driven trips that measure the driving speed and the cost of a failed attempt of the drive graph.
+    """A simulated car drives along the lanes and into slots, as the agent decides. Every seed is driven twice.
 
-    Agents that observe slots hardly ever attempt a taken one, so every seed is driven twice: trips without observations
-    provide failed attempts.
+    The drive with the scenario's observations of slots gives the speed and the duration of the manoeuvre; the drive
+    without observations before an attempt gives the cost of failed attempts. `parkenv compare --calibrated
+    OUT/calibrated.json` then compares agents under both costs.
     """
 
     table: ClassVar = Table("trips.jsonl", ("slots", "seed"))
     block: ClassVar = 5
     doing: ClassVar = "Driving"
     unit: ClassVar = "trips"
+    shown: ClassVar = {"rows": ("what", "n", "mean", "median", "p95")}
+    writes: ClassVar = "calibrated.json, trips.jsonl, summary.json and the figure"
+    examples: ClassVar = """
+        parkenv calibrate --scenario campus --episodes 200
+        parkenv compare --calibrated results/calibrate/calibrated.json
+        """
 
     kind: Literal["calibrate"] = "calibrate"
     scenario: OneScenario = scenario_spec("campus")
@@ -166,6 +173,18 @@ class CalibrationStudy(Study):
             "calibrated": calibrated,
             "rows": table,
         }
+
+    @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        from parkenv.world.scenario import KMH
+
+        measured = summary["calibrated"]
+        return [
+            f"Calibrated: driving at {measured['v_drive'] / KMH:.2f} km/h, a failed attempt costs "
+            f"{measured['failure_s']:.1f} s, and parking takes {measured['manoeuvre_s']:.1f} s that the drive graph "
+            f"leaves out. In {summary['trips']} trips: {summary['contacts']} contacts, {summary['rescues']} times "
+            "stuck."
+        ]
 
     @property
     def title(self) -> str:
