@@ -7,9 +7,10 @@ from typing import Annotated, Literal
 
 from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_console, print_rows, save_summary, stages, writing_into
+from parkenv.files.field_types import Probability
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
-from parkenv.scenarios.spec import Probability, scenario_spec
+from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.plurals import plural
 from parkenv.studies.fields import Scenarios
 from parkenv.studies.trips.manoeuvre_study import ManoeuvreStudy

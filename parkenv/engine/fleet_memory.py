@@ -13,7 +13,7 @@ from parkenv.engine import events, records
 from parkenv.engine.fleet_cars import FleetCars
 from parkenv.engine.fleet_options import TIMES, FleetOptions
 from parkenv.engine.records import CAR, FLEET, REPORT, SEARCH, STEP
-from parkenv.engine.searches import ScenarioRecords, Searches
+from parkenv.engine.searches import ScenarioRecords, Searches, most_observed_in
 from parkenv.engine.shared_slots import shared_slots_taken_at
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.kernel import SHARED_KIND
@@ -46,7 +46,7 @@ class FleetMemory:
         self.record, self.address = self._records[0], address_of(self._records, FLEET)
         # A car may learn of every slot at once, and attempt one.
         learns_all = any(kind.knows in ("shared", "full") for kind in self.drivers)
-        self._most_observed = 1 + lot.n_slots if learns_all else records.most_observed_in(scenarios)
+        self._most_observed = 1 + lot.n_slots if learns_all else most_observed_in(scenarios)
         self._observes = any(kind.policy is None for kind in self.drivers)
         self._tables = ScenarioRecords(scenarios)
         tables = self._tables.records

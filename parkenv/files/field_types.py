@@ -35,7 +35,8 @@ class Validated:
     """Base of dataclasses: fields with an annotated type, such as `Positive`, are checked when an object is made."""
 
     def __post_init__(self) -> None:
-        for name, adapter in _adapters(type(self)).items():
+        kind: Any = type(self)
+        for name, adapter in _adapters(kind).items():
             value = getattr(self, name)
             try:
                 object.__setattr__(self, name, adapter.validate_python(value))

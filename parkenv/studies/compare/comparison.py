@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from parkenv.errors import InputError
+from parkenv.files.field_types import Probability
 from parkenv.files.known_names import UNBEATEN
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, Spec
-from parkenv.scenarios.spec import Cost, Probability, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
+from parkenv.scenarios.spec import Cost, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
 from parkenv.show.columns import SETTING_AXES, Column, shared
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec, split_agents

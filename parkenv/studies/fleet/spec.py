@@ -14,10 +14,11 @@ from pydantic import BeforeValidator, model_validator
 from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
+from parkenv.files.field_types import Probability
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
 from parkenv.files.option import option, words_in
 from parkenv.files.spec_file import Axis, FilePath
-from parkenv.scenarios.spec import Probability, scenario_spec
+from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
     Agents,

@@ -230,14 +230,16 @@ class OccupancyLog:
         slot = {slot_id: i for i, slot_id in enumerate(self.slot_ids)}
         slots = np.array([slot[slot_id] for slot_id in other.slot_ids], np.int64)
         day = [np.searchsorted(days, log.days)[log.day] for log in (self, other)]
-        pairs = (
-            [self.slot, slots[other.slot]],
-            day,
-            [self.second, other.second],
-            [self.occupied, other.occupied],
+        return type(self)(
+            self.slot_ids,
+            tuple(days),
+            np.concatenate([self.slot, slots[other.slot]]),
+            np.concatenate(day),
+            np.concatenate([self.second, other.second]),
+            np.concatenate([self.occupied, other.occupied]),
+            self.max_gap_s,
+            f"{self.source},{other.source}",
         )
-        source = f"{self.source},{other.source}"
-        return type(self)(self.slot_ids, tuple(days), *map(np.concatenate, pairs), self.max_gap_s, source)
 
     @cached_property
     def weekend(self) -> BoolArray:

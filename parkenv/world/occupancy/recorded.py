@@ -375,7 +375,9 @@ class RecordedOccupancy(OccupancyModel):
             raise InputError(
                 f"{self.log.source}: no two consecutive observations on the days that are left to forecast from"
             )
-        return fit_hourly_decay_rates(*(part[used] for part in pairs[2:]))
+        return fit_hourly_decay_rates(
+            pairs.start[used], pairs.end[used], pairs.before[used], pairs.after[used]
+        )
 
     def _assign(self, day: str, known: IntArray) -> IntArray:
         n, m = self.n_slots, len(self.log.slot_ids)
