@@ -15,12 +15,12 @@ from parkenv.compiled.keyed_random import world_key
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
+from parkenv.files.known_names import OBSERVED, UNOBSERVED
 from parkenv.lots import packaged_lot
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.selection import blind_scenario
 from parkenv.studies.simulate import Observer
 from parkenv.studies.trips.calibration import calibrate
-from parkenv.studies.trips.calibration_study import OBSERVED, UNOBSERVED
 from parkenv.studies.trips.driven_car import (
     NO_ROOM,
     TAKEN,

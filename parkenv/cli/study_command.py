@@ -130,11 +130,12 @@ def study_command(kind: str) -> type[StudyCommand]:
     study = study_class(kind)
     base: Any = command_class(WITH_MORE[kind]) if kind in WITH_MORE else StudyCommand
     out = option(None, f"Folder for {study.writes}.", short="-o", default=str(study.folder({})))
-    model: Any = {"trust_model": (TrustModel, False)} if "agents" in study.model_fields else {}
-    fields: Any = {"study": (study, study()), "out": (Path | None, out)} | model
-    command: Any = create_model(study.__name__, __base__=base, __doc__=study.__doc__, **fields)
-    command.examples = study.examples
-    return cast(type[StudyCommand], command)
+    trust: Any = {"trust_model": (TrustModel, False)} if "agents" in study.model_fields else {}
+    fields: Any = {"study": (study, study()), "out": (Path | None, out)} | trust
+    model: Any = create_model(study.__name__, __base__=base, __doc__=study.__doc__, **fields)
+    made = cast(type[StudyCommand], model)
+    made.examples = study.examples
+    return made
 
 
 class Run(RunCommand, ExecutionSpec):

@@ -40,3 +40,5 @@ BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
 """Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`."""
+OBSERVED, UNOBSERVED = "observed", "unobserved"
+"""Whether the agent of a driven trip observes slots from the lane."""

@@ -16,11 +16,11 @@ from scipy import stats
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.parking_task import KINDS
 from parkenv.errors import InputError
+from parkenv.files.known_names import OBSERVED
 from parkenv.scenarios.calibration import Calibration
 from parkenv.show.figures.picture_files import INK, picture
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of, mean_interval
-from parkenv.studies.trips.calibration_study import OBSERVED
 from parkenv.studies.trips.driven_car import EDGE_KINDS, Leg, ParkingAttempt
 from parkenv.studies.trips.driven_search import Trip
 from parkenv.world.scenario import KMH, Scenario

@@ -11,6 +11,7 @@ from pydantic import model_validator
 
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
+from parkenv.files.known_names import OBSERVED, UNOBSERVED
 from parkenv.files.option import option
 from parkenv.scenarios.spec import Speed, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 CALIBRATED = "calibrated.json"
-OBSERVED, UNOBSERVED = "observed", "unobserved"
-"""Whether the agent observes slots from the lane, in the column `slots` of trips."""
 
 
 class _Trips(NamedTuple):
