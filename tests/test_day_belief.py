@@ -36,7 +36,7 @@ def test_a_forecast_of_certainty_is_doubted(level, slope):
     """A slot that is surely taken according to the forecast is free in half a `DOUBT` of all cases."""
     _, near, belief = forecast_of(60, level=level, slope=slope)
     belief.forecast[0] = 0.9999
-    sure, doubted = (DayBelief(belief, near, doubt=doubt).p_occupied(belief.time) for doubt in (0.0))
+    sure, doubted = (DayBelief(belief, near, doubt=doubt).p_occupied(belief.time) for doubt in (0.0, DOUBT))
     expected = belief.forecast + DOUBT * (0.5 - belief.forecast)
     np.testing.assert_allclose(doubted - sure, expected - belief.forecast, atol=0.2 * DOUBT)
     assert doubted[0] < 1.0 - 0.4 * DOUBT

@@ -43,9 +43,9 @@ def drawn(k):
 def folder(tmp_path):
     """A folder with a video of ten frames and a picture."""
     (tmp_path / "in").mkdir()
-    with film(tmp_path / "in" / "drive.mp4", SIZE, 10.0) as made:
+    with film(tmp_path / "in" / "drive.mp4", SIZE, 10.0) as append:
         for k in range(10):
-            made.add(drawn(k))
+            append(drawn(k))
     cv2.imwrite(str(tmp_path / "in" / "photo.png"), drawn(2))
     return tmp_path / "in"
 

@@ -149,7 +149,7 @@ def test_state_comes_back_with_its_pictures():
         ({"every": float("nan")}, "every is nan, want a finite number above 0"),
         ({"observation": "scans"}, "observation is 'scans', want one of full, scan"),
         ({"observation": "scan", "rig": "stereo"}, 'observation is "scan", want a rig with a laser'),
-        ({"arrival": "08:00"}, "arrival is '08:00', want an ArrivalWindow"),
+        ({"arrival": "08:00"}, "arrival is '08:00', want an instance of ArrivalWindow"),
     ],
 )
 def test_bad_arguments_are_named(options, words):

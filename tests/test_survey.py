@@ -119,7 +119,7 @@ def test_survey_and_map_on_the_command_line(tmp_path):
     spec = (out / "experiment.json").read_text()
     other = parkenv("survey", "--scenario", "campus", "--sessions", 1, "--jobs", 1, "--out", out)
     assert (other.returncode, len(other.stderr.splitlines())) == (2, 1)
-    assert "is a map of lot 'mini', not of 'campus'" in other.stderr
+    assert "--resume" in other.stderr
     assert (out / "experiment.json").read_text() == spec
     for words, message in (
         (["map", file, "--scenario", "campus"], "is a map of lot 'mini', not of 'campus'"),

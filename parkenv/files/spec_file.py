@@ -41,7 +41,7 @@ _WANTED = {
     "unexpected_keyword_argument": "no such key",
     "float_type": "a number",
     "finite_number": "a finite number",
-    "is_instance_of": "a {class}",
+    "is_instance_of": "an instance of {class}",
     "int_type": "a whole number",
     "string_type": "text",
     "bool_type": "true or false",

@@ -223,10 +223,10 @@ class Training:
         """Make a batch of search environments over all scenarios."""
         places = self.sides[0] if self.spec.curriculum is None else by_size(self.sides[0])
         env = SearchVecEnv(n_envs, places, REWARD_SCALE, self.spec.k, "local", MAX_STEPS)
-        self.open_places(env, 0)
+        self.open_scenarios(env, 0)
         return env
 
-    def open_places(self, env: SearchVecEnv, steps: int) -> None:
+    def open_scenarios(self, env: SearchVecEnv, steps: int) -> None:
         """Let the environments draw from the places that the curriculum has come to."""
         if self.spec.curriculum is not None:
             env.batch.n_scenarios = open_scenarios(len(self.sides[0]), steps / self.spec.steps)
@@ -472,7 +472,7 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         return self.subject.evaluate_every * (1 + steps // self.subject.evaluate_every)
 
     def _on_rollout_start(self) -> None:
-        self.subject.open_places(self.model.env, self.model.num_timesteps)
+        self.subject.open_scenarios(self.model.env, self.model.num_timesteps)
         # Between rollouts, so that a checkpoint loses no samples.
         if not self.curve or self.num_timesteps >= self._due:
             self._due = self._due_after(self.num_timesteps)
