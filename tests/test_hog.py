@@ -57,7 +57,7 @@ def test_a_descriptor_has_the_thesis_number_of_values():
         assert descriptor.describe(crop).shape == (size,) == (descriptor.size,)
 
 
-@pytest.mark.parametrize("normalization", ["cell", "neighbors"])
+@pytest.mark.parametrize("normalization", ["cell", "neighbors", "blocks"])
 def test_exposure_hardly_matters(normalization):
     rng = np.random.default_rng(2)
     crop = np.kron(rng.integers(10, 80, (16, 32)), np.ones((4, 4))).astype(np.uint8)
@@ -67,7 +67,7 @@ def test_exposure_hardly_matters(normalization):
     assert np.isfinite(descriptor.describe(np.full((64, 128), 9, np.uint8))).all()
 
 
-@pytest.mark.parametrize("normalization", ["cell", "neighbors"])
+@pytest.mark.parametrize("normalization", ["cell", "neighbors", "blocks"])
 def test_correlation_is_the_dot_product_with_every_window(normalization):
     rng = np.random.default_rng(3)
     image = rng.integers(0, 256, (100, 220), dtype=np.uint8)
@@ -100,7 +100,7 @@ def test_a_window_in_the_middle_is_the_crops_own_description():
     [
         (lambda: Descriptor(100, 64), "width is 100 px, want a multiple of 8"),
         (lambda: Descriptor(128, 8), "height is 8 px"),
-        (lambda: Descriptor(128, 64, "blocks"), "normalization is 'blocks'"),
+        (lambda: Descriptor(128, 64, "l1"), "normalization is 'l1'"),
         (lambda: Descriptor().describe(np.zeros((64, 64), np.uint8)), r"crop is \(64, 64\), want"),
         (lambda: cell_histograms(np.zeros((8, 8), np.float32)), "float32, want"),
     ],

@@ -81,6 +81,7 @@ def test_training_on_real_crops_generalizes_to_others(tmp_path):
     known, held_out = halves(read_crop_folder(tmp_path))
     # The crops are of many views and all alignments: a shifted car is still a car.
     settings = TrainingSettings(penalty=0.02, jitter=0, misaligned=0, rounds=0)
-    descriptor = Descriptor(128, 128)
-    model = train(known.positives, known.negatives, descriptor=descriptor, end_on=True, settings=settings)
+    model = train(
+        known.positives, known.negatives, descriptor=Descriptor(128, 128, "blocks"), end_on=True, settings=settings
+    )  # fmt: skip
     assert recall(model, held_out) > 0.965

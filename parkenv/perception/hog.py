@@ -1,4 +1,4 @@
-"""Histograms of oriented gradients (HOG): the thesis's descriptor, and a better normalization.
+"""Histograms of oriented gradients (HOG): the thesis's descriptor, and two better normalizations.
 
 The descriptor of a window consists of its cells (T §3.2.1): 8×8 pixels per cell, nine unsigned orientations, so 1152
 values for a side view of 128×64 and 2304 for a front of 128×128. Histograms are computed once per image; every window
@@ -23,7 +23,7 @@ from parkenv.errors import InputError, require_one_of
 
 CELL = 8  # pixels along each side of a cell
 ORIENTATIONS = 9  # bins over half a turn; opposite gradients count as one
-NORMALIZATIONS = ("neighbors", "cell")
+NORMALIZATIONS = ("neighbors", "cell", "blocks")
 
 _FAST: dict[str, Any] = {
     "fastmath": {"nnan", "ninf", "nsz", "arcp", "contract", "afn"},
@@ -44,10 +44,11 @@ class Descriptor:
         width, height: size of the window, px; whole cells.
         normalization: `cell`: each cell by its own energy, with as many values as in the thesis. `neighbors`: each cell
             by the energies of the four blocks of 2×2 cells that contain it, averaged; the same number of values.
+            `blocks`: Dalal and Triggs (2005), each block of 2×2 cells separately, 36 values each.
 
     Examples:
-        >>> Descriptor(128, 64).size, Descriptor(128, 128).size
-        (1152, 2304)
+        >>> Descriptor(128, 64).size, Descriptor(128, 128).size, Descriptor(128, 64, "blocks").size
+        (1152, 2304, 3780)
     """
 
     width: int = 128
@@ -64,7 +65,10 @@ class Descriptor:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape of a window's features: rows, values per cell, columns."""
-        return self.height // CELL, ORIENTATIONS, self.width // CELL
+        rows, columns = self.height // CELL, self.width // CELL
+        if self.normalization == "blocks":
+            return rows - 1, 4 * ORIENTATIONS, columns - 1
+        return rows, ORIENTATIONS, columns
 
     @property
     def size(self) -> int:
@@ -80,7 +84,8 @@ class Descriptor:
             (rows, values, columns) float32; columns come last, so that compiled loops run along them.
         """
         cells = cell_histograms(cv2.LUT(_checked(image), _ROOT) if image.size else image)
-        features: Float32Array = _by_cell(cells) if self.normalization == "cell" else _by_neighbors(cells)
+        normalize = {"cell": _by_cell, "neighbors": _by_neighbors, "blocks": _by_blocks}[self.normalization]
+        features: Float32Array = normalize(cells)
         return features
 
     def describe(self, crop: Image) -> Float32Array:
@@ -329,4 +334,28 @@ def correlate(features: Float32Array, weights: Float32Array) -> Float32Array:
                     for x in range(columns):
                         line[x] += w0 * source[x + j]
                     j += 1
+    return out
+
+
+@compiled(**_FAST)
+def _by_blocks(cells: Float32Array) -> Float32Array:
+    rows, values, columns = cells.shape
+    out = np.empty((max(rows - 1, 0), 4 * values, max(columns - 1, 0)), dtype=np.float32)
+    scale = _block_scales(cells)
+    clip = np.float32(_CLIP)
+    norm = np.empty(max(columns - 1, 0), dtype=np.float32)
+    for y in range(rows - 1):
+        norm[:] = 1e-6
+        for corner in range(4):
+            dy, dx = corner // 2, corner % 2
+            for k in range(values):
+                for x in range(columns - 1):
+                    v = min(cells[y + dy, k, x + dx] * scale[y + 1, x + 1], clip)
+                    out[y, corner * values + k, x] = v
+                    norm[x] += v * v
+        for x in range(columns - 1):
+            norm[x] = np.float32(1.0) / math.sqrt(norm[x])
+        for k in range(4 * values):
+            for x in range(columns - 1):
+                out[y, k, x] *= norm[x]
     return out
