@@ -25,7 +25,7 @@ from planners.network.features import (
     Situation,
     observe,
 )
-from planners.network.lookahead import Outlook, Scratch
+from planners.network.lookahead import Decision, Scratch
 from planners.network.policy import SHIPPED, NetworkPolicy
 
 CIRCLING = 0.1
@@ -156,8 +156,8 @@ class NetworkAgent(BeliefAgent):
             known.observed_at.astype(np.float64),
         )
         nothing = np.empty(0, np.int64)
-        outlook = Outlook(memory.by_cost, nothing, np.inf, memory.graph, belief, memory.scratch)
-        observe(now, self._failure_costs, outlook, out)
+        decision = Decision(memory.by_cost, nothing, np.inf, memory.graph, belief, memory.scratch)
+        observe(now, self._failure_costs, decision, out)
         return out
 
     def _circling(self, vertex: int, here: int, memory: NetworkSearch) -> FloatArray:

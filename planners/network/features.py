@@ -21,7 +21,7 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from planners.belief.path import expected_cost_to_slot, options_at_hand
 from planners.belief.planning_graph import BeliefSnapshot, PlanningGraph, is_hidden, needs_attempt
-from planners.network.lookahead import Outlook, best_option, next_target, path_value
+from planners.network.lookahead import Decision, best_option, next_target, path_value
 
 ACTION_COUNT = 6
 """Four moves, parking, waiting."""
@@ -118,9 +118,9 @@ def _logit(p: float) -> float:
 
 
 @compiled(error_model="numpy")
-def observe(now: Situation, failure_costs: FloatArray, outlook: Outlook, out: Features) -> None:
-    """Write the network's observation of a decision, given `FAILURE_COSTS` and an outlook without options."""
-    graph, belief = outlook.graph, outlook.belief
+def observe(now: Situation, failure_costs: FloatArray, decision: Decision, out: Features) -> None:
+    """Write the network's observation of a decision without options, given `FAILURE_COSTS`."""
+    graph, belief = decision.graph, decision.belief
     here, n, n_costs = now.here, len(belief.slots), len(failure_costs)
     ends, step_s = np.full(ACTION_COUNT, -1), np.full(ACTION_COUNT, np.inf)
     ends[:PARKING], step_s[:PARKING] = now.following, np.where(now.following >= 0, now.move_s, np.inf)
@@ -130,20 +130,20 @@ def observe(now: Situation, failure_costs: FloatArray, outlook: Outlook, out: Fe
     if now.wait_s < np.inf:
         ends[WAITING], step_s[WAITING] = here, now.wait_s
 
-    _, fallback_s = next_target(here, 0.0, failure_costs[n_costs // 2], outlook)
+    _, fallback_s = next_target(here, 0.0, failure_costs[n_costs // 2], decision)
     fallback_s = min(fallback_s, graph.give_up_s)
     options = options_at_hand(here, fallback_s, MOST_OPTIONS, graph, belief)
-    outlook = Outlook(outlook.by_cost, options, fallback_s, graph, belief, outlook.scratch)
+    decision = Decision(decision.by_cost, options, fallback_s, graph, belief, decision.scratch)
     path_s, p_none = np.full((ACTION_COUNT, n_costs), np.inf), np.ones((ACTION_COUNT, n_costs))
     first, option_s = np.full((ACTION_COUNT, n_costs), -1), np.full(ACTION_COUNT, np.inf)
     for a in range(ACTION_COUNT):
         out.allowed[a] = ends[a] >= 0
         if ends[a] < 0 or a == PARKING:
             continue
-        option_s[a] = step_s[a] + best_option(ends[a], step_s[a], outlook)
+        option_s[a] = step_s[a] + best_option(ends[a], step_s[a], decision)
         for c in range(n_costs):
             path_s[a, c], p_none[a, c], first[a, c] = path_value(
-                ends[a], step_s[a], failure_costs[c], outlook
+                ends[a], step_s[a], failure_costs[c], decision
             )
     best_path_s = np.array([path_s[:, c].min() for c in range(n_costs)])
     least_s = min(best_path_s.min(), option_s.min(), graph.give_up_s)
@@ -157,7 +157,7 @@ def observe(now: Situation, failure_costs: FloatArray, outlook: Outlook, out: Fe
     n_observed, n_actions, p_free_sum = (now.observed_at >= 0.0).sum(), out.allowed.sum(), 0.0
     for s in range(n):
         p_free_sum += belief.slots[s].p_free
-    candidates = _candidates(here, failure_costs, outlook)
+    candidates = _candidates(here, failure_costs, decision)
     shift, spread = _day_of_slots(candidates, now, belief)
     nearest_rate = belief.slots[candidates[0]].decay_rate if candidates[0] >= 0 else 0.0
 
@@ -202,7 +202,7 @@ def observe(now: Situation, failure_costs: FloatArray, outlook: Outlook, out: Fe
         row[DECAY_RATE] = _squashed(nearest_rate * scale)
         row[N_ACTIONS] = n_actions / ACTION_COUNT
         row[N_OPTIONS] = options.size / MOST_OPTIONS
-    _write_tokens(now, candidates, ends, step_s, least_s, outlook, out)
+    _write_tokens(now, candidates, ends, step_s, least_s, decision, out)
 
 
 @compiled(error_model="numpy")
@@ -257,14 +257,14 @@ def _write_tokens(
     ends: IntArray,
     step_s: FloatArray,
     least_s: float,
-    outlook: Outlook,
+    decision: Decision,
     out: Features,
 ) -> None:
     """Write the tokens: each candidate, -1 for none, seen through each action.
 
     `ends` and `step_s`, (6,), are the vertex after each action and its duration; `least_s` is that of the look-ahead.
     """
-    graph, belief = outlook.graph, outlook.belief
+    graph, belief = decision.graph, decision.belief
     scale = max(least_s, LEAST_SCALE)
     for i in range(CANDIDATES):
         s = candidates[i]
@@ -309,22 +309,22 @@ def _write_tokens(
             token[IS_END] = s == ends[a]
             token[DECAY] = _squashed(slot.decay_rate * min(drive_s, 1e6))
             expected_s = expected_cost_to_slot(
-                ends[a], s, slot.p_free, step_s[a], outlook.fallback_s, graph, belief
+                ends[a], s, slot.p_free, step_s[a], decision.fallback_s, graph, belief
             )
             token[EXPECTED_REGRET] = _regret(step_s[a] + expected_s, least_s, scale)
 
 
 @compiled(error_model="numpy")
-def _candidates(here: int, failure_costs: FloatArray, outlook: Outlook) -> IntArray:
+def _candidates(here: int, failure_costs: FloatArray, decision: Decision) -> IntArray:
     """Return `CANDIDATES` different slots, -1 for none: the best to drive to at failure costs taken in turn."""
-    graph, belief = outlook.graph, outlook.belief
+    graph, belief = decision.graph, decision.belief
     chosen, n_chosen = np.full(CANDIDATES, -1), 0
     n_costs = len(failure_costs)
     values = np.empty((n_costs, CANDIDATES))
     slots = np.full((n_costs, CANDIDATES), -1)
     for c in range(n_costs):
         values[c, :] = np.inf
-        for s in outlook.by_cost:
+        for s in decision.by_cost:
             if graph.cost_s[s] >= values[c, CANDIDATES - 1]:
                 break
             value = graph.drive_s[here, s] + graph.cost_s[s]

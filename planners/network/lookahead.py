@@ -48,7 +48,7 @@ class Scratch(NamedTuple):
         )
 
 
-class Outlook(NamedTuple):
+class Decision(NamedTuple):
     """A decision, as the look-ahead reads it."""
 
     by_cost: IntArray  # (n_slots,) the slots, least arrival cost first
@@ -60,11 +60,11 @@ class Outlook(NamedTuple):
 
 
 @compiled(error_model="numpy")
-def next_target(vertex: int, seconds: float, failure_s: float, outlook: Outlook) -> tuple[int, float]:
+def next_target(vertex: int, seconds: float, failure_s: float, decision: Decision) -> tuple[int, float]:
     """Return the slot that the thesis's planner drives to, and its value, s; -1 and inf if there is none."""
-    graph, belief, seen_at = outlook.graph, outlook.belief, outlook.scratch.seen_at
+    graph, belief, seen_at = decision.graph, decision.belief, decision.scratch.seen_at
     best, chosen = np.inf, -1
-    for s in outlook.by_cost:
+    for s in decision.by_cost:
         cost_s = graph.cost_s[s]
         if cost_s >= best:
             break  # the others cost more, however near they are
@@ -85,40 +85,40 @@ def next_target(vertex: int, seconds: float, failure_s: float, outlook: Outlook)
 
 
 @compiled(error_model="numpy")
-def best_option(vertex: int, seconds: float, outlook: Outlook) -> float:
+def best_option(vertex: int, seconds: float, decision: Decision) -> float:
     """Return the expected time, s, from a vertex to the best slot known to be free; inf if there is none."""
-    graph, belief, best = outlook.graph, outlook.belief, np.inf
-    for s in outlook.options:
+    graph, belief, best = decision.graph, decision.belief, np.inf
+    for s in decision.options:
         if graph.drive_s[vertex, s] + graph.cost_s[s] < best:
             p_free = belief.slots[s].p_free
-            value = expected_cost_to_slot(vertex, s, p_free, seconds, outlook.fallback_s, graph, belief)
+            value = expected_cost_to_slot(vertex, s, p_free, seconds, decision.fallback_s, graph, belief)
             best = min(best, value)
     return best
 
 
 @compiled(error_model="numpy")
-def path_value(vertex: int, start_s: float, failure_s: float, outlook: Outlook) -> tuple[float, float, int]:
+def path_value(vertex: int, start_s: float, failure_s: float, decision: Decision) -> tuple[float, float, int]:
     """Evaluate the path of the thesis's planner from a vertex, where the car is after `start_s` and observes, too.
 
     Return the expected time from now, s; P(nothing found on the path); its first target, or -1.
     """
-    graph, scratch = outlook.graph, outlook.scratch
-    scratch.weights[: len(outlook.belief.weights)] = outlook.belief.weights
+    graph, scratch = decision.graph, decision.scratch
+    scratch.weights[: len(decision.belief.weights)] = decision.belief.weights
     n_observed, k, seconds, sums = 0, 0, start_s, Sums(1.0, 0.0, 0.0)
     # `value` is what the thesis's planner expects from the current vertex: better slots are taken on the way.
-    target, value = next_target(vertex, seconds, failure_s, outlook)
+    target, value = next_target(vertex, seconds, failure_s, decision)
     first_target = target
     scratch.first[0] = 0
     while True:
         scratch.time[k] = seconds
-        scratch.stop_s[k] = best_option(vertex, seconds, outlook)
+        scratch.stop_s[k] = best_option(vertex, seconds, decision)
         n_before = n_observed
-        n_observed, sums = _observe_here(vertex, seconds, value, n_before, sums, outlook)
+        n_observed, sums = _observe_here(vertex, seconds, value, n_before, sums, decision)
         scratch.first[k + 1] = n_observed
         if sums.p_none < ENOUGH or k == MOST_STOPS - 1 or n_observed == MOST_OBSERVATIONS:
             break
         if target == vertex or (scratch.slots[n_before:n_observed] == target).any():
-            target, value = next_target(vertex, seconds, failure_s, outlook)
+            target, value = next_target(vertex, seconds, failure_s, decision)
         if target < 0:
             break
         if target == vertex:
@@ -151,10 +151,10 @@ class Sums(NamedTuple):
 
 @compiled(error_model="numpy")
 def _observe_here(
-    vertex: int, seconds: float, value: float, n_observed: int, sums: Sums, outlook: Outlook
+    vertex: int, seconds: float, value: float, n_observed: int, sums: Sums, decision: Decision
 ) -> tuple[int, Sums]:
     """Add the observations from a vertex, the cheapest first; return the number of all, and their sums."""
-    graph, belief, scratch = outlook.graph, outlook.belief, outlook.scratch
+    graph, belief, scratch = decision.graph, decision.belief, decision.scratch
     weights, before = scratch.weights[: len(belief.weights)], n_observed
     p_none, p_sum, cost_sum = sums
     for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):

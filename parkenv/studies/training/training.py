@@ -375,11 +375,11 @@ class Training:
         self, places: Sequence[Scenario], times: NDArray[np.float64], parked: NDArray[np.bool_]
     ) -> list[Row]:
         """Return a row of the test for each place that a search was in."""
-        place_of = np.array([scenario_of_episode(seed, 0, len(places)) for seed in self.test_seeds])
+        scenario_index = np.array([scenario_of_episode(seed, 0, len(places)) for seed in self.test_seeds])
         return [
-            {"place": place.name, "slots": place.lot.n_slots, **times_row(times[its], parked[its])}
+            {"place": place.name, "slots": place.lot.n_slots, **times_row(times[of_place], parked[of_place])}
             for i, place in enumerate(places)
-            if (its := place_of == i).any()
+            if (of_place := scenario_index == i).any()
         ]
 
     def replays(self, summary: Row, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
