@@ -15,10 +15,7 @@ from parkenv.errors import InputError
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; it replaces `path` at the end of the block, or is deleted on failure.
-
-    The previous file at `path` stays intact until then.
-    """
+    """Yield a temporary path beside `path`; it replaces `path` at the end of the block, or is deleted on failure."""
     path = Path(path)
     beside = _temporary(path)
     try:
@@ -32,7 +29,6 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text as UTF-8; see `atomic_write`."""
     with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
 
@@ -67,7 +63,6 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _temporary(path: Path) -> Path:
-    """Return the temporary file that is written beside a file."""
     if not path.name:
         raise InputError(f"{path}: cannot be written: is no name of a file")
     return path.with_name(f".{path.name}.{os.getpid()}.part")

@@ -27,10 +27,7 @@ def is_command() -> bool:
 
 
 def end_on_signals() -> None:
-    """Let Ctrl-C and the like end this process at once with exit code 128 + n, where they have no other handler.
-
-    `parkenv.cli.stop_signals` takes over later.
-    """
+    """Let Ctrl-C and the like end this process with code 128 + n, until `parkenv.cli.stop_signals` takes over."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
@@ -53,7 +50,6 @@ def distrust_working_folder() -> None:
 
 
 def skip_settings() -> None:
-    """Import libraries that the working folder has settings for, without these."""
     for file, library in _SETTINGS.items():
         if library not in sys.modules and os.path.lexists(file):
             with chdir(Path(__file__).parent):

@@ -12,20 +12,14 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import write_text
 from parkenv.files.limited_reading import csv_records
 
-MAX_NUMBER = 1e12
-"""Maximum absolute value of a number; sums and squares of larger ones could overflow."""
+MAX_NUMBER = 1e12  # maximum absolute value of a number; sums and squares of larger ones could overflow
 _MAX_DIGITS = 15
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """Texts that begin with one of these run as formulas in spreadsheets; an apostrophe before it prevents that."""
 
 
 class Kind(NamedTuple):
-    """What a column holds.
-
-    Attributes:
-        wanted: in words, for messages.
-        parse: returns the value of a text; raises ValueError if the text is something else.
-    """
+    """What a column holds: in words, and what makes it of a text, or raises ValueError."""
 
     wanted: str
     parse: Callable[[str], Any]
@@ -55,12 +49,7 @@ WHOLE = Kind(f"a whole number of at most {_MAX_DIGITS} digits", _whole)
 
 
 def typed_records(path: Path, kind_of: Callable[[str], Kind]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the rows of a table with their line numbers; none if there is no file.
-
-    Args:
-        path: the file.
-        kind_of: returns what a column holds, by its name.
-    """
+    """Yield the rows of a table, none without a file, with their line numbers; `kind_of` gives a column's kind."""
     if not path.exists():
         return
     for line, record in csv_records(path):
@@ -77,10 +66,7 @@ def typed_records(path: Path, kind_of: Callable[[str], Kind]) -> Iterator[tuple[
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, header: bool = False) -> str:
-    """Return rows as CSV text, below a header if wanted; values that a row lacks are empty.
-
-    A text that a spreadsheet would run as a formula gets an apostrophe before it, which `typed_records` removes.
-    """
+    """Return rows as CSV text; what spreadsheets would run as a formula gets an apostrophe, removed on reading."""
     text = _Lines()
     writer = csv.DictWriter(text, columns, lineterminator="\r\n")  # so both are quoted within texts
     if header:
@@ -90,10 +76,7 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, heade
 
 
 def csv_columns(columns: Sequence[Sequence[Any]]) -> str:
-    """Return columns of equal length as lines of CSV text without a header; a long table is written ten times faster.
-
-    Its texts are as harmless as those of `csv_text`.
-    """
+    """Return columns of equal length as harmless CSV text without a header, ten times faster than rows."""
     text = _Lines()
     cells = (
         [_harmless(value) for value in column] if column and isinstance(column[0], str) else column
@@ -107,7 +90,6 @@ class _Lines(io.StringIO):
     """Lines of a table, which end with a line feed alone."""
 
     def write(self, line: str) -> int:
-        """Append a line."""
         return super().write(line.removesuffix("\r\n") + "\n")
 
 
@@ -129,5 +111,4 @@ def _is_formula(text: str) -> bool:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write a CSV file with a header, atomically."""
     write_text(path, csv_text(columns, rows, header=True))

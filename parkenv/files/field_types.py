@@ -47,7 +47,6 @@ class Validated:
 
 @cache
 def _adapters(kind: Any) -> dict[str, TypeAdapter[Any]]:
-    """Return what checks each field of a dataclass."""
     hints = get_type_hints(kind, include_extras=True)
     names = [field.name for field in fields(kind) if field.init and "Annotated" in str(hints[field.name])]
     return {name: TypeAdapter(hints[name]) for name in names}

@@ -23,7 +23,6 @@ MAX_PIXELS = 100_000_000
 
 
 def read_image(path: Path) -> Image:
-    """Read an image file as (h, w) grey or (h, w, 3) RGB, uint8; transparency is dropped."""
     return decode_image(read_bytes(path), str(path))
 
 
@@ -73,7 +72,6 @@ def image_text(path: Path, key: str) -> str | None:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the image files in a folder and its subfolders, in natural order of their names."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     files = files_in(folder, SUFFIXES)
@@ -83,7 +81,6 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def files_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Return the files in a folder and its subfolders with one of the suffixes, in natural order of their names."""
     return sorted((f for f in folder.rglob("*") if f.suffix.lower() in suffixes), key=natural_order)
 
 

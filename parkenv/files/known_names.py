@@ -6,10 +6,8 @@ from typing import Literal, get_args
 
 PackagedLot = Literal["campus", "jam", "street", "mini", "town"]
 PACKAGED_LOTS: tuple[PackagedLot, ...] = get_args(PackagedLot)
-SCENARIO_NAMES = PACKAGED_LOTS
-"""Packaged scenarios; each has a lot of the same name."""
-LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
-"""Suffixes of lot files."""
+SCENARIO_NAMES = PACKAGED_LOTS  # packaged scenarios; each has a lot of the same name
+LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")  # suffixes of lot files
 SensorModelName = Literal["perfect", "blind", "laser", "stereo"]
 SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)
 RigName = Literal["laser", "stereo", "both_sides", "camera"]
@@ -21,21 +19,18 @@ WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
 LocaliserName = Literal["none", "scan-matching"]
 LOCALISERS: tuple[LocaliserName, ...] = get_args(LocaliserName)
 """What corrects the pose of a survey's car; see `parkenv.mapping.scan_matching`."""
-MapName = Literal["empty", "right", "wrong"]
-"""Maps that a commute starts from."""
+MapName = Literal["empty", "right", "wrong"]  # maps that a commute starts from
 KnowledgeName = Literal["own", "shared", "reserve", "full"]
 """What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`."""
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
-UNBEATEN = ("oracle", "bound")
-"""Agents that compete with no other: they know what others do not."""
+UNBEATEN = ("oracle", "bound")  # agents that compete with no other: they know what others do not
 SCENE_LEVELS = tuple(
     f"{kind}-{level}"
     for level in ("normal", "complex", "extreme", "moving")
     for kind in ("perpendicular", "oblique", "parallel")
 )
 """Levels of drawn scenes with a kind of slot each, the easiest first; see `parkenv.driving.levels`."""
-MAX_CARS = 1_000_000
-"""Maximum number of cars of a world."""
+MAX_CARS = 1_000_000  # maximum number of cars of a world
 BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)

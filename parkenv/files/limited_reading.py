@@ -34,8 +34,7 @@ from parkenv.files.atomic_write import write_text
 
 MAX_BYTES = 64_000_000
 """Maximum size of a file, if its reader sets no other; 64 MB of JSON become at most about 1.5 GB in memory."""
-MAX_SPEC_BYTES = 1_000_000
-"""Maximum size of TOML and YAML, which hold no data and are read slowly."""
+MAX_SPEC_BYTES = 1_000_000  # maximum size of TOML and YAML, which hold no data and are read slowly
 MAX_DEPTH = 100
 """Maximum nesting of tables and lists in TOML and YAML; JSON may have 200 levels, the limit of its parser."""
 _HUGE = re.compile(rb"[eE]\+?\d{3}")
@@ -57,11 +56,9 @@ class Counted(io.RawIOBase):
         self._stream, self._left, self._most, self._name = stream, most, most, name
 
     def readable(self) -> bool:
-        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Read at most as many bytes as the buffer has; return their number."""
         data = self._stream.read(min(len(buffer), self._left + 1))
         self._left -= len(data)
         if self._left < 0:
@@ -122,7 +119,6 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
 
 
 def read_bytes(path: str | Path, most: int = MAX_BYTES) -> bytes:
-    """Return the content of a file."""
     with open_limited(path, most) as file:
         return file.read()
 
@@ -134,18 +130,11 @@ def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
 
 
 def read_json(path: str | Path, most: int = MAX_BYTES, *, finite: bool = False) -> Any:
-    """Return the content of a JSON file; see `parse_json`."""
     return parse_json(read_text(path, most), str(path), finite=finite)
 
 
 def parse_json(text: str | bytes, name: str, *, finite: bool = False) -> Any:
-    """Return the value of a JSON text: at most 200 levels deep, numbers that fit a float, no lone surrogates.
-
-    Args:
-        text: the text, in UTF-8.
-        name: of the text, for messages.
-        finite: whether to refuse NaN, infinities, and numbers that become one.
-    """
+    """Return a JSON value: at most 200 levels, numbers that fit a float, `finite` if wanted, no lone surrogates."""
     data = text.encode() if isinstance(text, str) else text
     _require_short_numbers(data, name)
     try:
@@ -160,7 +149,6 @@ def parse_json(text: str | bytes, name: str, *, finite: bool = False) -> Any:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Return the content of a TOML file of at most `MAX_SPEC_BYTES`."""
     text = read_text(path, MAX_SPEC_BYTES)
     _require_short_numbers(text.encode(), str(path))
     try:
@@ -212,13 +200,7 @@ class _PlainTree(ElementTree.TreeBuilder):
 
 
 def read_xml(path: str | Path, root: str, most: int = MAX_BYTES // 4) -> ElementTree.Element:
-    """Return the root of an XML file without document type.
-
-    Args:
-        path: the file.
-        root: name of the root, without namespace.
-        most: maximum size, bytes; a tree takes some twenty times as much.
-    """
+    """Return the root, of this name without namespace, of XML without document type; trees take 20 times as much."""
     with naming(path):
         try:
             tree = ElementTree.fromstring(read_bytes(path, most), ElementTree.XMLParser(target=_PlainTree()))
@@ -230,12 +212,7 @@ def read_xml(path: str | Path, root: str, most: int = MAX_BYTES // 4) -> Element
 
 
 def csv_rows(path: str | Path, most: int = MAX_BYTES) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of a CSV file that are not empty, with their line numbers; all are as wide as the first.
-
-    Args:
-        path: the file, gzipped if its name ends in `.gz`.
-        most: maximum size, bytes unpacked.
-    """
+    """Yield the rows of a CSV file that are not empty, with their line numbers; all are as wide as the first."""
     width = 0
     with open_limited(path, most) as file:
         text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
@@ -260,7 +237,6 @@ def csv_records(path: str | Path, most: int = MAX_BYTES) -> Iterator[tuple[int, 
 
 
 def _require_short_numbers(data: bytes, name: str) -> None:
-    """Refuse integers that no float can hold."""
     if _LONG_NUMBER.search(data):
         raise InputError(f"{name}: has a number of more than 300 digits, the most that is read")
 
@@ -289,16 +265,12 @@ def _require_shallow(content: Any, name: str, *, plain: bool = False) -> None:
             raise InputError(f"{name}: has text that is not Unicode: {value!a:.40}")
 
 
-MAX_MEMBERS = 10_000
-"""Maximum number of files in an archive."""
+MAX_MEMBERS = 10_000  # maximum number of files in an archive
 _HEADER_ERRORS = (tokenize.TokenError, OverflowError, RecursionError, MemoryError)
 
 
 def parse_zip(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, bytes]:
-    """Return the files of a zip archive, by name, at most `most` bytes in all when unpacked.
-
-    Sizes are those that the archive claims; the library unpacks no more than that.
-    """
+    """Return the files of a zip archive; it claims to unpack to at most `most` bytes, the library unpacks no more."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = archive.infolist()
@@ -317,7 +289,6 @@ def parse_zip(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, bytes]
 
 
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an `.npz` file; see `parse_arrays`."""
     return parse_arrays(read_bytes(path), str(path))
 
 
@@ -358,7 +329,6 @@ class JsonFormat:
     meaning: str
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
-        """Read the fields of a file, without format and version."""
         try:
             content = read_json(Path(path))
         except InputError as error:
@@ -370,6 +340,5 @@ class JsonFormat:
         return content
 
     def write(self, path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
-        """Write a file atomically."""
         content = {"format": self.name, "version": self.version, **fields}
         write_text(path, json.dumps(content, indent=1) + "\n")

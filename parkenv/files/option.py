@@ -85,12 +85,7 @@ def words_in(text: str) -> list[str]:
 
 
 def numbers_in(text: str, count: int | None = None) -> list[float]:
-    """Convert comma-separated numbers.
-
-    Args:
-        text: the numbers.
-        count: how many are wanted, all of them finite; None for any.
-    """
+    """Convert comma-separated numbers, `count` finite ones if it is given."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:

@@ -32,8 +32,7 @@ WHERE of.type = 'table' AND "column".hidden
 Messages = Callable[[set[str]], Iterator[tuple[str, int, Any]]]
 
 SUFFIXES = (".mcap", ".db3", ".bag")
-MAX_PART_BYTES = 256_000_000
-"""Maximum size of a chunk or a message, unpacked."""
+MAX_PART_BYTES = 256_000_000  # maximum size of a chunk or a message, unpacked
 MAX_MERGED_BYTES = 1_000_000_000
 """Maximum size, unpacked, of chunks that overlap in time, which are read at the same time."""
 MAX_GROWTH = 100
@@ -47,7 +46,6 @@ def is_recording(path: Path) -> bool:
 
 
 def require_rosbags() -> None:
-    """Check that the library rosbags is installed."""
     with with_extra("a recorded drive", "bags"):
         import rosbags.rosbag2  # noqa: F401
 
@@ -143,11 +141,7 @@ def _limit_library() -> None:
 
 
 def _unpacked(make: Callable[[], Any], data: bytes, most: int = MAX_PART_BYTES) -> bytes:
-    """Return the content of compressed data, one or more frames.
-
-    Raises:
-        ValueError: it is not whole, or larger than `most` or `MAX_PART_BYTES`.
-    """
+    """Return the content of compressed data, one or more frames, within limits, else raise ValueError."""
     most = min(most, MAX_PART_BYTES)
     content = b""
     while data:
@@ -186,7 +180,6 @@ def picture_in(message: Any, where: str) -> Image:
 
 
 def _raw(message: Any, where: str) -> Image:
-    """Return an uncompressed image."""
     channels = {"rgb8": 3, "bgr8": 3, "mono8": 1, "8UC1": 1, "8UC3": 3}.get(message.encoding)
     height, width, step = int(message.height), int(message.width), int(message.step)
     if channels is None:
@@ -223,7 +216,6 @@ class Footage:
 
     @property
     def name(self) -> str:
-        """The file and the topic."""
         return f"{self.path}:{self.topic}"
 
     @property
@@ -248,7 +240,6 @@ class Footage:
 
 
 def footage_in(path: Path) -> list[Footage]:
-    """Return the footage of every camera in a recording that has pictures, by topic."""
     with open_recording(path) as (types, _):
         topics = sorted(topic for topic, kind in types.items() if kind in (IMAGE, COMPRESSED_IMAGE))
     found = []

@@ -15,14 +15,12 @@ from zlib import crc32
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import parse_json
 
-MAX_BYTES = 1_000_000_000
-"""Maximum size of a file."""
+MAX_BYTES = 1_000_000_000  # maximum size of a file
 _PATIENCE_S = 30.0
 _APPLICATION_ID = 0x7061726B  # "park"
 _VERSION = 3
 _HEAD = "head"
-SYNC_S = 1.0
-"""Least time between two flushes to disk of a writer that is alone, s."""
+SYNC_S = 1.0  # least time between two flushes to disk of a writer that is alone, s
 _TABLE = (
     "CREATE TABLE row (name TEXT NOT NULL, key TEXT NOT NULL, value TEXT NOT NULL, crc32 INTEGER NOT NULL, "
     "PRIMARY KEY (name, key)) STRICT"
@@ -109,7 +107,6 @@ class RowFile:
         self._db.close()
 
     def has(self, name: str, key: Any) -> bool:
-        """Return whether the file holds a row."""
         query = "SELECT 1 FROM row WHERE name = ? AND key = ?"
         with self._errors_in_words():
             return self._db.execute(query, (name, to_json(key))).fetchone() is not None
@@ -129,12 +126,7 @@ class RowFile:
                 yield row
 
     def write(self, rows: Iterable[tuple[str, Any, Row]], *, replaces: Iterable[str] = ()) -> None:
-        """Write rows with their names and keys in one transaction, in place of rows with the same keys.
-
-        Args:
-            rows: name, key and row of each.
-            replaces: names all of whose rows they replace.
-        """
+        """Write names, keys and rows in one transaction, in place of those of these keys and of names it `replaces`."""
         due = time.monotonic() >= self._synced + SYNC_S
         with self._errors_in_words():
             if self._alone:
@@ -145,11 +137,7 @@ class RowFile:
         self._synced = time.monotonic() if due else self._synced
 
     def add(self, name: str, key: str, row: Row) -> None:
-        """Write a row in one transaction; several processes may write at the same time.
-
-        Raises:
-            InputError: there is one with this key, or the file cannot be written.
-        """
+        """Write a row with a new key in one transaction; several processes may write at the same time."""
         with self._errors_in_words():
             try:
                 with self._transaction("IMMEDIATE"):
@@ -178,7 +166,6 @@ class RowFile:
 
     @contextmanager
     def _errors_in_words(self) -> Iterator[None]:
-        """Convert database errors to one-line InputErrors."""
         try:
             yield
         except sqlite3.DatabaseError as error:

@@ -55,7 +55,6 @@ T = TypeVar("T")
 
 
 def resolved_path(value: object, info: ValidationInfo) -> object:
-    """Resolve a path relative to the folder of the file that it was read from."""
     if not isinstance(value, str | Path):
         return value
     folder = (info.context or {}).get(_FOLDER, Path())
@@ -101,8 +100,7 @@ class OrText:
         return {"anyOf": [{"type": "string"}, handler(core_schema)]}
 
 
-Several = Annotated[tuple[T, ...], Strict(False)]
-"""A list in the file, a tuple in Python."""
+Several = Annotated[tuple[T, ...], Strict(False)]  # a list in the file, a tuple in Python
 
 
 def require(condition: object, message: str) -> None:
@@ -140,7 +138,6 @@ class Spec(BaseModel):
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a TOML file, or a JSON file (`.json`)."""
         path = Path(path)
         return cls.parse(read_tables(path), str(path), path.parent).of_file(path)
 
@@ -153,34 +150,21 @@ class Spec(BaseModel):
     def parse(
         cls, tables: Mapping[str, Any], source: str | Mapping[str, str], folder: str | Path = "."
     ) -> Self:
-        """Validate the content of a file or of options.
-
-        Args:
-            tables: nested mappings and lists.
-            source: name of the source for messages, such as the file; or the options that set fields, by field.
-            folder: folder that relative paths start from.
-        """
+        """Validate tables; for messages, `source` names their file or each field's option; paths are from `folder`."""
         try:
             return cls.model_validate(tables, context={_FOLDER: Path(folder)})
         except ValidationError as error:
             raise InputError(_message(cls, error, source)) from error
 
     def changed(self, source: str | Mapping[str, str] = "", /, **changes: Any) -> Self:
-        """Return a copy with some fields changed, validated again.
-
-        Args:
-            source: name of the source for messages; or the options that set fields, by field.
-            changes: plain values or specs, by field name.
-        """
+        """Return a copy with some fields changed, validated again; `source` names the options that set them."""
         fields = {name: getattr(self, name) for name in type(self).model_fields} | changes
         return type(self).parse(fields, source).of_file(self._file)
 
     def write(self, path: Path) -> None:
-        """Write the specification as JSON, atomically, including fields at their defaults."""
         write_text(path, json.dumps(self.tables(), indent=2) + "\n")
 
     def files(self) -> list[Path]:
-        """Return every file named in the specification, at any depth."""
         found: list[Path] = []
         for name in type(self).model_fields:
             value = getattr(self, name)
@@ -192,12 +176,10 @@ class Spec(BaseModel):
         return list(dict.fromkeys(found))
 
     def tables(self) -> dict[str, Any]:
-        """Return the specification as plain JSON values, without unset fields."""
         return self.model_dump(mode="json", exclude_none=True)
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Read a TOML or JSON file without validation."""
     tables = read_json(path, MAX_SPEC_BYTES) if path.suffix == ".json" else read_toml(path)
     if not isinstance(tables, dict):
         raise InputError(f"{path}: is a {type(tables).__name__}, want a JSON object")
@@ -239,7 +221,6 @@ def _fault(model: type[BaseModel], detail: ErrorDetails, field: str) -> str:
 
 
 def wanted(detail: ErrorDetails) -> str:
-    """Return what is wanted instead of a wrong value."""
     if detail["type"] not in _WANTED:
         return detail["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     numbers = {k: f"{v:.7g}" if isinstance(v, int | float) else v for k, v in detail.get("ctx", {}).items()}
@@ -247,7 +228,6 @@ def wanted(detail: ErrorDetails) -> str:
 
 
 def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterator[str]:
-    """Yield the valid keys of the table at a location in the file."""
     at: type[BaseModel] = model
     for part in location:
         if isinstance(part, str) and part in at.model_fields:
@@ -256,7 +236,6 @@ def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterato
 
 
 def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the classes of tables in the type of a field."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):

@@ -14,8 +14,7 @@ from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER, TEXT, Kind, typed_records
 from parkenv.files.limited_reading import read_xml
 
-MONDAY_S = 4 * 86_400
-"""1970-01-05, the first Monday of Unix time, s."""
+MONDAY_S = 4 * 86_400  # 1970-01-05, the first Monday of Unix time, s
 _WEEK_S = 604_800  # smaller times are since Monday 00:00
 _UNIX_S = (1e8, 9e9)  # 1973 to 2255; nanoseconds fit 64 bits
 _STEP_M = 1.0  # between the positions of which a heading is made
@@ -107,11 +106,7 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
 
 
 def stamp_in(text: str, timezone_s: float) -> int:
-    """Return a time, ns of Unix time; see `read_track`.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return a time, ns of Unix time, or raise ValueError; see `read_track`."""
     try:
         seconds: float = NUMBER.parse(text)
         is_of_week, fraction = 0.0 <= seconds < _WEEK_S, 0

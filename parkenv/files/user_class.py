@@ -55,12 +55,7 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
 
 
 def failure_of(error: Exception, names: Iterable[str]) -> InputError | None:
-    """Return what to tell of an error that came by way of a user's class; None if none of them had to do with it.
-
-    Args:
-        error: what was raised.
-        names: classes, `MODULE:CLASS`.
-    """
+    """Return what to tell of an error in one of the classes, `MODULE:CLASS`; None if none had to do with it."""
     files = {
         str(file_of_class(name)): name for name in names if name.partition(":")[0] in sys.modules
     }  # in this process
@@ -85,6 +80,5 @@ def find_module(name: str) -> str | None:
 
 
 def file_of_class(name: str) -> Path | None:
-    """Return the file of a module imported by `load_class`; None if it has no file."""
     file = sys.modules[name.partition(":")[0]].__file__
     return None if file is None else Path(file)

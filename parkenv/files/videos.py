@@ -53,7 +53,6 @@ class Video:
 
     @property
     def name(self) -> str:
-        """The file."""
         return str(self.path)
 
     @property
@@ -63,7 +62,6 @@ class Video:
 
     @classmethod
     def of(cls, path: Path) -> Video:
-        """Open a video file, and read its first frame."""
         with _opened(path) as capture:
             there, first = capture.read()
             if not there or first is None:
@@ -99,10 +97,7 @@ class Video:
 
 @contextmanager
 def film(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[Image], object]]:
-    """Yield a function that appends a frame, (h, w, 3) uint8, RGB, to a film (`.mp4`), which is written atomically.
-
-    An odd last row or column of `size`, width and height in px, is left out, as encoders want.
-    """
+    """Yield a function that appends a frame, (h, w, 3) uint8, RGB, to an `.mp4`; odd last rows and columns are cut."""
     even = size[0] // 2 * 2, size[1] // 2 * 2
     with atomic_write(path) as beside:
         unfinished = beside.with_name(f"{beside.name}.mp4")  # the encoder goes by the name

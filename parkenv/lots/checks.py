@@ -57,7 +57,6 @@ def check_lot(path: str | Path) -> list[LotProblem]:
 
 
 def _import_problems(path: Path) -> list[LotProblem]:
-    """Return what an importable file lacks, and what its import leaves out."""
     try:
         draft = import_lot(path)
     except InputError as error:
@@ -75,8 +74,6 @@ def _import_problems(path: Path) -> list[LotProblem]:
 
 
 def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
-    """Return warnings about probable drawing mistakes."""
-
     def warn(feature: int, message: str) -> None:
         warnings.append(LotProblem("warning", feature, message))
 
@@ -156,7 +153,6 @@ def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tupl
 def _reach_warnings(
     lot: ParkingLot, numbers: Sequence[int | None], entry_numbers: Sequence[int | None]
 ) -> Iterator[LotProblem]:
-    """Return slots that cannot be reached or do not lead to another slot, and entries that do not lead to a slot."""
     n = lot.n_slots
     graph = lot.drive_matrix()
     reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))

@@ -42,7 +42,6 @@ class Provenance:
     caution: str = ""  # what decides results and is a guess
 
     def document(self) -> dict[str, Any]:
-        """Return the JSON object that a lot file keeps."""
         return {
             "source": self.source,
             "guesses": list(self.guesses),
@@ -55,7 +54,6 @@ class Provenance:
 
 
 def combined_error_probability(issues: tuple[QualityIssue, ...]) -> float:
-    """Return the probability, 0 to 1, that a lot is wrong, if its issues are independent."""
     right = 1.0
     for issue in issues:
         right *= 1.0 - min(max(issue.error_probability, 0.0), 1.0)
@@ -113,7 +111,6 @@ class ImportOptions:
                     raise InputError(f"{what} is {point!r}, want two finite numbers")
 
     def box(self, frame: LocalFrame | None) -> tuple[float, float, float, float] | None:
-        """Return the bounds in the lot's frame: least x and y, greatest x and y, m; None without bounds."""
         if self.bounds is None:
             return None
         corners = points_in_frame(frame, self.bounds)
@@ -124,10 +121,7 @@ class ImportOptions:
 
 
 def points_in_frame(frame: LocalFrame | None, pairs: tuple[tuple[float, float], ...]) -> FloatArray:
-    """Convert pairs of numbers to metres, (n, 2), in the lot's frame.
-
-    A pair within a degree of the frame's origin is a latitude and a longitude; any other pair is metres.
-    """
+    """Convert pairs to metres, (n, 2), in the lot's frame; those within a degree of it are latitude and longitude."""
     points = np.array(pairs, dtype=np.float64).reshape(-1, 2)
     if frame is None or frame.origin is not None or not len(points):
         return points
@@ -177,7 +171,6 @@ class LotDraft:
 
     @classmethod
     def of_lot(cls, lot: ParkingLot) -> LotDraft:
-        """Return the draft of a complete lot."""
         return cls(
             **{name: getattr(lot, name) for name in _SHARED},
             slots=Slots.of_lot(lot),
@@ -186,7 +179,6 @@ class LotDraft:
         )
 
     def lot(self) -> ParkingLot:
-        """Create the lot."""
         try:
             return self._lot()
         except GraphError as error:
@@ -200,10 +192,7 @@ class LotDraft:
         return ParkingLot(**{name: getattr(self, name) for name in _SHARED}, **self.slots.columns())
 
     def searchable(self) -> LotDraft:
-        """Return the draft without slots and facilities that no entry leads to; they are listed in `left_out`.
-
-        An incomplete draft is returned unchanged.
-        """
+        """Return the draft without slots and facilities that no entry leads to; an incomplete one unchanged."""
         try:
             lot = self._lot()
         except GraphError as error:
@@ -222,10 +211,7 @@ class LotDraft:
         return self._without(lost, LeftOut("slots that cannot be reached from an entry", ids))
 
     def in_left_hand_traffic(self) -> LotDraft:
-        """Return the draft where cars keep to the left, and those parked along a lane head the way of its traffic.
-
-        An incomplete draft keeps its slots.
-        """
+        """Return the draft where cars keep to the left, and those parked along a lane head the way of its traffic."""
         draft = replace(self, left_hand=True)
         try:
             lot = draft._lot()

@@ -55,16 +55,13 @@ class Slots:
 
     @classmethod
     def of_lot(cls, lot: ParkingLot) -> Self:
-        """Return the slots of a lot."""
         return cls(*(getattr(lot, f"slot_{f.name}") for f in fields(cls)))
 
     @classmethod
     def joined(cls, parts: Sequence[Slots]) -> Self:
-        """Concatenate the slots of several rows."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def columns(self) -> dict[str, Any]:
-        """Return the keyword arguments of `ParkingLot`."""
         return {f"slot_{f.name}": getattr(self, f.name) for f in fields(self)}
 
     def mouths(self) -> FloatArray:
@@ -261,7 +258,6 @@ class StreetGrid:
     across: NDArray[np.int64]
 
     def lanes(self) -> list[Lane]:
-        """Return one lane per street."""
         streets = [*self.crossings, *self.crossings.swapaxes(0, 1)]
         directions = np.concatenate([self.along, self.across])
         return [

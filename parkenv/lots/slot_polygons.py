@@ -61,10 +61,7 @@ def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) ->
 
 
 def nearest_on_lanes(lanes: Sequence[Lane], xy: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the lane point nearest to each of `xy`, (n, 2) m, the lane's unit direction, and whether it is one-way.
-
-    Without lanes, each point is its own nearest point.
-    """
+    """Return the lane point nearest to each, (n, 2) m, or itself, the lane's direction, and whether it is one-way."""
     if not lanes or not len(xy):
         return xy, np.zeros_like(xy), np.zeros(len(xy), dtype=bool)
     start = np.concatenate([lane.points[:-1] for lane in lanes])

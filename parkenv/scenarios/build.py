@@ -54,8 +54,7 @@ if TYPE_CHECKING:
 
 LOT_KMH, TOWN_KMH = 10.0, 20.0
 """Default driving speeds: in a car park (the thesis's), and in a town, whose junctions are part of the mean."""
-MIN_PAST_DAYS = 7
-"""Days of counts that a forecast needs at least."""
+MIN_PAST_DAYS = 7  # days of counts that a forecast needs at least
 ScenarioSource = str | Path | Mapping[str, Any] | ScenarioSpec | ParkingLot | Scenario
 ScenarioSources = ScenarioSource | Sequence[ScenarioSource]
 
@@ -120,11 +119,7 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
 
 
 def require_changes(owners: Sequence[type], changes: Iterable[str], *others: str) -> None:
-    """Check the further keywords of an environment, its class first of `owners`: fields of the scenario, or others.
-
-    Raises:
-        TypeError: one is unknown; the message also lists the environment's own arguments.
-    """
+    """Raise TypeError for keywords that are no argument of the owners, field of the scenario, or one of the others."""
     own = [
         name
         for owner in owners
@@ -266,7 +261,6 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
 
 
 def _own_world(text: str, lot: ParkingLot, goal: int) -> OccupancyModel:
-    """Make a world of a user's own, `MODULE:CLASS` or `MODULE:CLASS(OPTION=VALUE,...)`."""
     options = parse_call(text, "world")
     name = options.pop("name")
     kind = load_class(name, "world", "forecast(arrival)")
@@ -335,7 +329,6 @@ def _forecast_counts(
 
 
 def car_parks(file: Path) -> list[str]:
-    """Return the car parks in a file of counts that show some use."""
     from parkenv.forecast.counts import Counts
 
     counts = Counts.read(file)

@@ -14,8 +14,7 @@ from parkenv.files.field_types import NotNegative, Positive, Validated, Whole
 from parkenv.files.limited_reading import JsonFormat
 from parkenv.world.scenario import Scenario
 
-MAX_VALUE = 1_000_000
-"""Maximum of each number of a calibration; sums of larger ones could overflow."""
+MAX_VALUE = 1_000_000  # maximum of each number of a calibration; sums of larger ones could overflow
 _Positive = Annotated[Positive, Field(le=MAX_VALUE)]
 _Seconds = Annotated[NotNegative, Field(le=MAX_VALUE)]
 _Count = Annotated[Whole, Field(ge=1, le=MAX_VALUE)]
@@ -37,7 +36,6 @@ class Calibration(Validated):
     speed_limit: _Positive  # speed limit on the lanes, m/s
 
     def applied(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with the measured speed and failure cost, under the same name."""
         return scenario.replace(v_drive=self.v_drive, failure_s=self.failure_s)
 
     def to_file(self, path: Path) -> None:

@@ -19,13 +19,11 @@ if TYPE_CHECKING:  # help and completion read fields alone
     from parkenv.world.demand import Arrivals, Duration, TownDemand
     from parkenv.world.lot import ParkingLot
 
-MAX_RATE = 1e6
-"""Maximum number of cars an hour."""
+MAX_RATE = 1e6  # maximum number of cars an hour
 _RATES = f"a number from 0 to {MAX_RATE:g}, or {DAY_HOURS} of these, one for each hour of the day"
 
 
 def _rates(value: object) -> object:
-    """Expand a number to those of all hours."""
     numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value] * DAY_HOURS
     if len(numbers) != DAY_HOURS:
         raise ValueError(_RATES)

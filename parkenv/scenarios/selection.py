@@ -14,8 +14,7 @@ from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 
-BLIND = "-blind"
-"""Suffix of the names of these scenarios."""
+BLIND = "-blind"  # suffix of the names of these scenarios
 FIRST_SHARE, ALL_AT = 0.1, 0.5
 """A curriculum begins with this share of the scenarios, and has all of them after this share of the training."""
 
@@ -31,7 +30,6 @@ def scenario_of_episode(seed: int, episode: int, n: int) -> int:
 
 
 def seeds_by_scenario(seeds: Sequence[int], n: int) -> list[list[int]]:
-    """Return the seeds whose first episode is in each of n scenarios."""
     groups: list[list[int]] = [[] for _ in range(n)]
     for seed in seeds:
         groups[scenario_of_episode(seed, 0, n)].append(seed)
@@ -53,10 +51,7 @@ def lot_share(lot: ParkingLot) -> float:
 
 
 def split_by_lot(scenarios: Sequence[Scenario], held_out: float) -> tuple[list[Scenario], list[Scenario]]:
-    """Split scenarios by their lots: those to train on, and those held out, whose `lot_share` is below `held_out`.
-
-    So scenarios on one lot are on one side, and lots that are added later do not move the others.
-    """
+    """Split scenarios by `lot_share`: those to train on, and those held out below `held_out`."""
     sides: tuple[list[Scenario], list[Scenario]] = ([], [])
     for scenario in scenarios:
         sides[lot_share(scenario.lot) < held_out].append(scenario)
@@ -70,7 +65,6 @@ def split_by_lot(scenarios: Sequence[Scenario], held_out: float) -> tuple[list[S
 
 
 def by_size(scenarios: Sequence[Scenario]) -> list[Scenario]:
-    """Return scenarios in order of their numbers of slots, and of their names."""
     return sorted(scenarios, key=lambda scenario: (scenario.lot.n_slots, scenario.name))
 
 
@@ -86,7 +80,6 @@ def open_scenarios(n: int, progress: float) -> int:
 
 
 def require_different_names(scenarios: Sequence[Scenario]) -> None:
-    """Check that tables can tell scenarios apart."""
     names = [scenario.name for scenario in scenarios]
     for i, name in enumerate(names):
         if name in names[:i]:

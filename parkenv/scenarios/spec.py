@@ -59,15 +59,12 @@ from parkenv.world.tariff import NO_ZONE, VALUE_OF_TIME, Price, Zone, parse_chan
 from parkenv.world.tariff import Hours as ZoneHours
 from parkenv.world.week import HOUR_S
 
-Speed = Annotated[float, Field(ge=0.1, le=300.0)]
-"""km/h."""
-Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]
-"""s, at most a day."""
+Speed = Annotated[float, Field(ge=0.1, le=300.0)]  # km/h
+Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]  # s, at most a day
 Count = Annotated[int, Field(ge=0, le=1_000)]
 Size = Annotated[float, Field(ge=1.0, le=100.0)]  # m
 MAX_SLOTS = 1_000_000
-SAME_SLOTS = "same"
-"""Mapping of a log whose slots have the names of the lot's."""
+SAME_SLOTS = "same"  # mapping of a log whose slots have the names of the lot's
 
 
 def _require_one(spec: Spec, names: tuple[str, ...], least: int = 1) -> None:
@@ -100,7 +97,6 @@ class CityLot(Spec):
 
 
 def _lot_tables(value: object) -> object:
-    """Expand text to a table: the name of a packaged lot, or else a file."""
     if isinstance(value, Path):
         return {"file": value}
     if not isinstance(value, str):
@@ -218,7 +214,6 @@ Date = Annotated[date, BeforeValidator(_date)]
 
 
 def _day_error_tables(value: object) -> object:
-    """Expand a number to a table: the level."""
     return {"level": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
@@ -415,8 +410,7 @@ class Speeds(Spec):
     v_walk_kmh: Speed = 4.0
 
 
-MAX_PRICE = 1e6
-"Highest price per hour."
+MAX_PRICE = 1e6  # highest price per hour
 
 
 def _per_hour(text: str) -> float:
@@ -585,7 +579,6 @@ class ZoneSpec(Spec):
     users: Several[str] | None = Field(None, description="Classes of drivers who may park there.")
 
     def changed_rules(self, zone: Zone) -> Zone:
-        """Return a zone with the rules that are given here."""
         own: dict[str, Any] = {"price": Price.parse(self.price)} if self.price is not None else {}
         if self.hours is not None:
             own["hours"] = ZoneHours.parse(self.hours)
@@ -685,7 +678,6 @@ class ScenarioSpec(Spec):
 
     @property
     def title(self) -> str:
-        """Name of the scenario in tables: its own, or else the lot's."""
         lot = self.lot
         return self.name or lot.name or (lot.file.stem if lot.file else "city" if lot.city else "grid")
 

@@ -68,7 +68,6 @@ class RawFeature:
 
 
 def is_coordinate(value: Any) -> bool:
-    """Whether a JSON value is a finite number within `FARTHEST`."""
     # Comparisons with NaN are false; a bool is an int in Python but not a number in JSON.
     return type(value) in (float, int) and abs(value) <= FARTHEST
 
@@ -96,7 +95,6 @@ class LotContents:
     errors: list[LotProblem] = field(default_factory=list)
 
     def columns(self) -> dict[str, Any]:
-        """Return the keyword arguments of `ParkingLot`."""
         return {
             "name": self.name,
             "slot_ids": tuple(self.slot_ids),
@@ -114,13 +112,11 @@ class LotContents:
         }
 
     def _weights(self, kind: str) -> dict[str, FloatArray]:
-        """Return the weights of goals or entries by purpose, (n,) each; 0 where one has none."""
         each = self.weights[kind]
         purposes = dict.fromkeys(purpose for weights in each for purpose in weights)
         return {name: np.array([weights.get(name, 0.0) for weights in each]) for name in purposes}
 
     def error(self, feature: int | None, message: str) -> None:
-        """Record an error of a feature, or of the file as a whole."""
         self.errors.append(LotProblem("error", feature, message))
 
 
@@ -165,7 +161,6 @@ def graph_errors(contents: LotContents) -> list[LotProblem]:
 
 
 def _facility_errors(contents: LotContents) -> list[LotProblem]:
-    """Return the errors of facilities that are out of reach; those of other features are known."""
     if contents.errors or not contents.facilities:
         return []
     try:
@@ -183,7 +178,6 @@ _COUNTED = ("gate_s", "inside_s", "known", "delay_s")  # properties of counted f
 
 
 def read_zones(document: Any) -> dict[str, Zone]:
-    """Return the rules of the member `zones`."""
     if not isinstance(document, dict):
         raise InputError(f"zones is {document!r:.40}, want an object with the rules of each zone")
     rules = {}
@@ -203,7 +197,6 @@ def read_zones(document: Any) -> dict[str, Zone]:
 
 
 def zone_document(zone: Zone) -> dict[str, Any]:
-    """Return the rules of a zone, as the member `zones` has them."""
     price = zone.price.members()
     document: dict[str, Any] = {"price": price} if price else {}
     if zone.hours is not None:
@@ -226,7 +219,6 @@ def read_zone(properties: dict[str, Any], what: str, rules: Collection[str]) -> 
 
 
 def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray) -> None:
-    """Validate the facilities of a file and add the valid ones."""
     seen: set[str] = set()
     for feature in raw:
         given = dict(feature.properties)
@@ -262,7 +254,6 @@ def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray
 
 
 def facility_properties(facility: Facility) -> dict[str, Any]:
-    """Return the properties of a facility's feature."""
     given: dict[str, Any] = {"name": facility.name, "type": facility.kind}
     if facility.zone:
         given["zone"] = facility.zone
@@ -273,7 +264,6 @@ def facility_properties(facility: Facility) -> dict[str, Any]:
 
 
 def read_weights(feature: RawFeature) -> dict[str, float]:
-    """Return the weights of a goal or an entry by purpose; empty if not given."""
     weights = feature.properties.get("weights", {})
     if not isinstance(weights, dict):
         raise InputError(f"{feature.kind}: weights is {weights!r:.40}, want numbers by purpose")
@@ -288,10 +278,7 @@ SLOT_AGREEMENT = 0.01  # largest distance, m, between a slot's polygon and the r
 
 
 def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exact: bool) -> None:
-    """Validate the slots of a file and add the valid ones.
-
-    Exact properties are used only in a local frame: after a projection, stale ones would go unnoticed.
-    """
+    """Add the valid slots; exact properties count in a local frame: after a projection, stale ones go unnoticed."""
     if not raw:
         return
     rings = [xy[feature.parts[0]] for feature in raw]
@@ -381,7 +368,6 @@ def _slot_id(feature: RawFeature) -> str:
 
 
 def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
-    """Return the parking cost of a slot, s; 0 if not given."""
     cost = properties.get("parking_cost_s", 0.0)
     if not is_coordinate(cost) or cost < 0.0:
         raise InputError(f"slot {slot_id!r:.40}: parking_cost_s is {cost!r:.40}, want seconds, at least 0")
@@ -389,7 +375,6 @@ def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
 
 
 def _facility(properties: dict[str, Any], slot_id: str, drawn: Collection[str]) -> str:
-    """Return the facility that a slot belongs to, one of those whose slots are drawn; empty text if not given."""
     facility = properties.get("facility", "")
     if not (isinstance(facility, str) and facility in drawn) and "facility" in properties:
         hint = nearest(str(facility), drawn)
@@ -400,7 +385,6 @@ def _facility(properties: dict[str, Any], slot_id: str, drawn: Collection[str]) 
 
 
 def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:
-    """Return exact x, y, yaw, length, width and mouth; None for a slot with only a polygon."""
     absent = [name for name in SLOT_SHAPE if name not in properties]
     if len(absent) == len(SLOT_SHAPE):
         return None

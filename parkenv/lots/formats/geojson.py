@@ -88,7 +88,6 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
 
 
 def check_lot_output(path: Path) -> None:
-    """Check that `write_lot` can write a file, before any work."""
     _check_suffix(path)
     check_writable(path)
 
@@ -216,7 +215,6 @@ def read_contents(path: Path) -> LotContents:
 
 
 def _add_feature(contents: LotContents, feature: RawFeature, parts: list[FloatArray]) -> None:
-    """Add a lane, a turn, an entry, a goal, or a wall with one part per ring."""
     if feature.kind in ("lane", "turn"):
         names = ("oneway", "speed") if feature.kind == "lane" else ("only",)
         given = {name: value for name in names if (value := feature.properties.get(name)) is not None}
@@ -252,7 +250,6 @@ def _load(path: Path) -> Any:
 
 
 def _check_head(document: Any, stem: str) -> str:
-    """Validate the top-level members; return the lot's name."""
     if isinstance(document, dict) and "elements" in document:
         raise InputError("holds Overpass JSON, want XML (`[out:xml]`) or overpass-turbo's GeoJSON")
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
@@ -279,7 +276,6 @@ def _check_head(document: Any, stem: str) -> str:
 def _check_feature(
     number: int, feature: Any, positions: list[tuple[float, float]], kinds_seen: set[object]
 ) -> RawFeature:
-    """Validate a feature and append its positions to `positions`."""
     if not isinstance(feature, dict) or feature.get("type") != "Feature":
         raise InputError("want a GeoJSON object of type 'Feature'")
     properties, geometry = (

@@ -48,7 +48,6 @@ class Positions:
 
     @property
     def converts(self) -> bool:
-        """Whether `to_lonlat` changes anything."""
         return self.frame is not None or self._grid is not None
 
     def to_lonlat(self, points: FloatArray) -> FloatArray:
@@ -61,10 +60,7 @@ class Positions:
 
     @classmethod
     def of(cls, document: dict[str, Any], path: Path) -> Positions:
-        """Recognise the positions of a parsed FeatureCollection: by `frame`, by `crs`, else by their size.
-
-        Metres that nothing but their size tells are warned of.
-        """
+        """Recognise the positions of a FeatureCollection: by `frame`, by `crs`, else by their size, with a warning."""
         rings, spaces = _outlines(document)
         low, high = (
             f(np.concatenate([*rings, np.zeros((0 if rings else 1, 2))]), axis=0) for f in (np.min, np.max)
@@ -102,10 +98,7 @@ class Positions:
 
 
 def _outlines(document: dict[str, Any]) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return the outer rings of a collection's polygons, (k, 2), and those of them that are parking spaces.
-
-    Rings that are none are left to the reader to complain of. Without any polygon, the first is all other positions.
-    """
+    """Return the outer rings of polygons, (k, 2), else all other positions, and those rings that are parking spaces."""
     rings: list[FloatArray] = []
     spaces: list[FloatArray] = []
     others: list[FloatArray] = []
@@ -142,7 +135,6 @@ def _line_of(shape: object, coordinates: Any) -> Any:
 
 
 def _usual_size(rings: Iterable[FloatArray]) -> tuple[float, float]:
-    """Return the medians of the short and the long sides of outlines."""
     polygons = np.array([shapely.Polygon(ring) for ring in rings], dtype=object)
     corners = [shapely.get_coordinates(box) for box in shapely.minimum_rotated_rectangle(polygons)]
     sides = [np.sort(np.hypot(*np.diff(c[:3], axis=0).T)) for c in corners if len(c) == 5]
@@ -151,7 +143,6 @@ def _usual_size(rings: Iterable[FloatArray]) -> tuple[float, float]:
 
 
 def _crs_name(crs: object) -> str | None:
-    """Return the name of a file's coordinate reference system; None where it has none."""
     if crs is None:
         return None
     properties = crs.get("properties") if isinstance(crs, dict) else None

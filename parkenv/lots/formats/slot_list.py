@@ -35,7 +35,6 @@ class SlotList:
     frame: LocalFrame | None  # geographic frame of the lot; None for a file in metres
 
     def subset(self, index: IntArray) -> SlotList:
-        """Return some of the slots."""
         ids = tuple(self.ids[i] for i in index.tolist())
         yaw = None if self.yaw is None else self.yaw[index]
         return SlotList(ids, self.xy[index], yaw, self.parking_cost_s[index], self.zone[index], self.frame)
@@ -111,12 +110,7 @@ def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple
 
 
 def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
-    """Draft a lot from a list of slots.
-
-    The centres become rectangles (`parkenv.lots.infer.spaces`), from which lanes are inferred
-    (`parkenv.lots.infer.layout`). Where that fails, the draft has only slot centres and says why; it can still be
-    drawn. A list has neither entries nor goals; they are given or guessed.
-    """
+    """Draft a lot from a list of slots; where no lanes can be inferred it has their centres alone, and says why."""
     path = Path(path)
     options = options or ImportOptions()
     listed = read_slot_list(path)

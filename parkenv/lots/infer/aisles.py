@@ -45,7 +45,6 @@ class Aisle:
 
     @property
     def line(self) -> shapely.LineString:
-        """The centre line."""
         return shapely.LineString(self.points)
 
 
@@ -55,10 +54,7 @@ def find_aisles(
     blocked: Sequence[shapely.Geometry],
     roads: Sequence[FloatArray] = (),
 ) -> list[Aisle]:
-    """Return the aisles that serve the rows; rows along `roads`, centre lines, (k, 2) m each, need none.
-
-    Cars drive over none of the `blocked` polygons: spaces, buildings.
-    """
+    """Return the aisles of the rows, clear of the `blocked` polygons; rows along `roads`, (k, 2) m each, need none."""
     on_road = [bool(is_on_road(spaces, p.row, p.side, p.view, roads).mean() > 0.5) for p in rows]
     if all(on_road):
         return []
@@ -87,7 +83,6 @@ def find_aisles(
 
 
 def _faced(rows: Sequence[OpenRow], owner: IntArray, r: int) -> IntArray:
-    """Return, (k,), the row with which each space of a row shares its aisle; -1 for none."""
     own = rows[r]
     result = np.full(len(own.row), -1)
     normal = own.row.normal(own.side)
@@ -119,7 +114,6 @@ def _depth(part: OpenRow, is_faced: NDArray[np.bool_]) -> FloatArray:
 def _continuations(
     rows: Sequence[OpenRow], stops: Sequence[FloatArray], tree: shapely.STRtree
 ) -> set[tuple[int, int]]:
-    """Return pairs of rows of which one continues the other's aisle across a gap."""
     ends = [(r, k) for r, part in enumerate(rows) for k in {0, len(part.row) - 1}]
     at = np.array([stops[r][k] for r, k in ends])
     found = set()
@@ -148,7 +142,6 @@ def _continuations(
 def _aisle(
     rows: Sequence[OpenRow], members: IntArray, stops: Sequence[FloatArray], faced: Sequence[IntArray]
 ) -> Aisle:
-    """Return the aisle of a set of rows."""
     xy = np.concatenate([stops[r] for r in members])
     along = np.concatenate([rows[r].row.along for r in members])
     pitch = np.concatenate([rows[r].row.pitch for r in members])
@@ -229,7 +222,6 @@ def _curve(xy: FloatArray, half: float) -> FloatArray:
 
 
 def _groups(xy: FloatArray, reach: float) -> list[NDArray[np.bool_]]:
-    """Divide points into small groups, each around the first point that is in no group yet."""
     left = np.ones(len(xy), dtype=bool)
     groups = []
     while left.any():
@@ -281,7 +273,6 @@ def _distances(xy: FloatArray, way: FloatArray, most: float, tree: shapely.STRtr
 
 
 def _clear_parts(points: FloatArray, tree: shapely.STRtree) -> list[FloatArray]:
-    """Return the parts of a line that a car can drive, without the ends that run against something."""
     line = shapely.LineString(points)
     near = tree.query(line, predicate="dwithin", distance=LEAST_ROOM)
     if not len(near):

@@ -32,10 +32,7 @@ class Connection:
 
 
 def connect(lines: Sequence[FloatArray], space: FreeSpace, longest: float) -> list[Connection]:
-    """Connect centre lines, (k, 2) m each, by ways up to `longest` m.
-
-    Lines that share a point are connected already.
-    """
+    """Connect centre lines, (k, 2) m each, that share no point, by ways up to `longest` m."""
     stations, xy, owner = _samples(lines)
     cells = space.cells(xy)
     distance, before, source, pairs = space.spread(np.unique(cells))
@@ -111,7 +108,6 @@ def _samples(lines: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray, IntAr
 def _road_graph(
     lines: Sequence[FloatArray], stations: FloatArray, xy: FloatArray, owner: IntArray
 ) -> nx.Graph:
-    """Return the graph of all samples, connected along lines and where lines meet."""
     graph = nx.Graph()
     graph.add_nodes_from(range(len(xy)))
     along = owner[1:] == owner[:-1]
@@ -170,7 +166,6 @@ class FreeSpace:
         return np.asarray(np.ravel_multi_index((index[:, 0], index[:, 1]), self.shape))
 
     def centers(self, cells: IntArray) -> FloatArray:
-        """Return the centres, (n, 2) m, of cells."""
         return self.xy.reshape(-1, 2)[cells]
 
     def spread(self, start: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray]:
@@ -203,12 +198,10 @@ class FreeSpace:
         return np.asarray(distance), before.astype(np.int64), source.astype(np.int64), pairs
 
     def is_clear(self, points: FloatArray, clearance: float) -> bool:
-        """Whether a polyline, (k, 2) m, keeps a distance from all obstacles."""
         line = shapely.LineString(points)
         return len(self._boundary.query(line, predicate="dwithin", distance=clearance)) == 0
 
     def room(self, points: FloatArray) -> float:
-        """Return the distance of a polyline, (k, 2) m, to the nearest obstacle."""
         return float(shapely.distance(shapely.LineString(points), self._whole))
 
     def pulled_straight(self, path: FloatArray) -> FloatArray:

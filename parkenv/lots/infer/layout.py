@@ -136,7 +136,6 @@ def infer_lot(
 
 
 def _large_enough(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[list[OpenRow], dict[str, list[int]]]:
-    """Return the rows without spaces that a car does not fit into, and those spaces by reason."""
     kept: list[OpenRow] = []
     small: dict[str, list[int]] = {}
     for part in rows:
@@ -175,7 +174,6 @@ def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
 
 
 def _is_clear(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
-    """Whether no lane, (n,), leads closer past a slot than a car can drive."""
     tree = shapely.STRtree([shapely.LineString(line.points) for line in lines])
     hit = tree.query(slots.boxes(shrink=0.2), predicate="dwithin", distance=CAR_ROOM)[0]
     clear = np.ones(len(slots), dtype=bool)
@@ -212,8 +210,7 @@ def _slots(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[IntArray, Slots, in
     return np.concatenate(members)[order], Slots.joined(parts)[order], widened
 
 
-MOST_LOST = 0.2
-"""Largest fraction of the spaces that an import may leave out because no aisle reaches them."""
+MOST_LOST = 0.2  # largest fraction of the spaces that an import may leave out because no aisle reaches them
 SHARE_UNSURE = 0.35  # certainty below which the open side of a row counts as a guess
 TWO_WAY_WIDTH = 4.5  # least width, m, of a two-way aisle
 
@@ -233,12 +230,7 @@ def draft_inferred_lot(
     walls: Sequence[FloatArray] = (),
     outlines: Sequence[FloatArray] = (),
 ) -> LotDraft:
-    """Draft a lot whose lanes were inferred.
-
-    `source` is where the spaces come from, `unit` what a space is in the file, such as "outlines", `left_out` names
-    spaces that were not used for the inference, by reason. Goals are (k, 2) m; if they were found in the file,
-    `goal_note` says where. Walls and outlines, those of parking areas for the figure, are (k, 2) m each.
-    """
+    """Draft an inferred lot; `unit` is what a space is in the file, such as "outlines"; `left_out` are others."""
     without_aisle = {reason: [spaces.ids[i] for i in members] for reason, members in lot.left_out.items()}
     lost = sum(map(len, without_aisle.values()))
     if lost > MOST_LOST * len(spaces):

@@ -56,7 +56,6 @@ def noded(lines: Sequence[Line]) -> list[Line]:
 
 
 def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
-    """Let ends that nearly touch coincide, move ends onto lines that they nearly touch, with a corner there."""
     ends = [(k, end) for k in range(len(points)) for end in (0, -1)]
     nodes: list[FloatArray] = []
     users: list[list[tuple[int, int]]] = []
@@ -130,10 +129,9 @@ def without_stubs(lines: Sequence[Line], count_served: Callable[[Sequence[Line]]
 
 
 def directed(lines: Sequence[Line], wanted: dict[int, int]) -> tuple[list[Line], list[int]]:
-    """Make aisles one-way as far as every lane can still be reached from every other.
+    """Make aisles one-way while every lane leads to every other; return the lines, and aisles that stay two-way.
 
-    `wanted` has, for each aisle with a direction, the number of spaces that ask for it; larger ones come first. Returns
-    the lines, and the aisles that had to stay two-way.
+    `wanted` has, for each aisle with a direction, the number of spaces that ask for it; larger ones come first.
     """
     refused = []
     chosen = {k for k, line in enumerate(lines) if line.one_way and line.source < 0}
@@ -178,7 +176,6 @@ def largest_part(lines: Sequence[Line]) -> list[list[int]]:
 
 
 def lanes_of(lines: Sequence[Line]) -> list[Lane]:
-    """Return the lanes, with at most four ways out of every junction."""
     return limit_junctions([Lane(line.points, line.one_way) for line in lines])
 
 
@@ -202,7 +199,6 @@ def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
 
 
 def _leaving(lines: Sequence[FloatArray], oneway: Sequence[bool], at: set[tuple[int, int]]) -> int:
-    """Count the ways that lead away from a node, given as (lane, point) pairs."""
     forward = sum(i + 1 < len(lines[k]) for k, i in at)
     return forward + sum(i > 0 and not oneway[k] for k, i in at)
 
@@ -272,10 +268,7 @@ class Entry:
 
 
 def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[shapely.Geometry]) -> Entry:
-    """Return the most plausible entry: a lane that can be continued out of the car park, with short drives to spaces.
-
-    `spaces_xy`, (n, 2) m, are stops before the spaces.
-    """
+    """Return the most plausible entry; `spaces_xy`, (n, 2) m, are stops before the spaces."""
     for corridor, longest in ((CORRIDOR, LONGEST_WAY_OUT), (NARROW_CORRIDOR, 3 * LONGEST_WAY_OUT)):
         entry = _best_way_out(lines, spaces_xy, blocked, corridor, longest)
         if entry is not None:
@@ -316,7 +309,6 @@ def entries_from_streets(
 
 
 def _outermost(lines: Sequence[Line]) -> Entry:
-    """Return an entry at the end or crossing of lanes that is farthest out, for a car park closed on all sides."""
     ends = np.concatenate([line.points[[0, -1]] for line in lines])
     hull = shapely.convex_hull(shapely.MultiPoint(np.concatenate([line.points for line in lines])))
     inside = shapely.distance(shapely.boundary(hull), shapely.points(ends))

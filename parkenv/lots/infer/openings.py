@@ -47,7 +47,6 @@ class OpenRow:
 
 
 def least_aisle(row: Row) -> float:
-    """Least width, m, of an aisle that serves a row."""
     return LEAST_KERBSIDE + (LEAST_PERPENDICULAR - LEAST_KERBSIDE) * float(np.sin(row.slant)) ** 2
 
 
@@ -95,7 +94,6 @@ class _Scene:
         self.tree = shapely.STRtree(self.shapes)
 
     def view(self, row: Row, side: int) -> View:
-        """Look ahead from three points of each mouth, across the row."""
         k, n = len(row), len(self.spaces)
         normal = row.normal(side)
         mouths = row.mouths(self.spaces, side)
@@ -135,7 +133,6 @@ def _runs(is_open: NDArray[np.bool_]) -> list[IntArray]:
 def is_on_road(
     spaces: Spaces, row: Row, side: int, view: View, roads: Sequence[FloatArray]
 ) -> NDArray[np.bool_]:
-    """Whether a road lies before each mouth, (k,), within reach and in view."""
     if not len(roads):
         return np.zeros(len(row), dtype=bool)
     mouths = row.mouths(spaces, side)

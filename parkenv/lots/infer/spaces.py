@@ -25,10 +25,8 @@ from parkenv.lots.generators import BAY_SIZE, KERB_SIZE
 from parkenv.world.drive_graph import component_labels
 from parkenv.world.lot import corner_points
 
-LEAST_AREA, GREATEST_AREA = 4.0, 250.0
-"""Areas, m², outside which an outline is a mistake of drawing."""
-DRAWN_TWICE = 0.5
-"""Fraction of a space's area from which an overlap means that it was drawn twice."""
+LEAST_AREA, GREATEST_AREA = 4.0, 250.0  # areas, m², outside which an outline is a mistake of drawing
+DRAWN_TWICE = 0.5  # fraction of a space's area from which an overlap means that it was drawn twice
 STRAIGHTENED = 0.2  # tolerance, m, for further corners on the sides of an outline
 
 
@@ -52,7 +50,6 @@ class Spaces:
 
     @property
     def across(self) -> FloatArray:
-        """Unit vectors to the left of the axes, (n, 2)."""
         return np.stack([-self.axis[:, 1], self.axis[:, 0]], axis=1)
 
     def boxes(self, shrink: float = 0.0) -> NDArray[np.object_]:
@@ -62,7 +59,6 @@ class Spaces:
         return np.atleast_1d(np.asarray(shapely.polygons(corners)))
 
     def subset(self, index: IntArray) -> Spaces:
-        """Return some of the spaces."""
         return Spaces(
             tuple(self.ids[i] for i in index.tolist()),
             self.xy[index],
@@ -99,7 +95,6 @@ def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> S
 
 
 def validate_areas(ids: Sequence[str], area: FloatArray) -> None:
-    """Raise an error for areas, (n,) m², outside the range of parking spaces."""
     for i in np.flatnonzero((area < LEAST_AREA) | (area > GREATEST_AREA)).tolist():
         raise InputError(
             f"{ids[i]}: a parking space of {area[i]:.1f} m², want {LEAST_AREA:g} to {GREATEST_AREA:g} m²"
@@ -107,7 +102,6 @@ def validate_areas(ids: Sequence[str], area: FloatArray) -> None:
 
 
 def rectangle_corners(outline: shapely.Geometry) -> FloatArray:
-    """Return the corners, (4, 2) m, of the rectangle of an outline."""
     simple = shapely.simplify(outline, STRAIGHTENED)
     if len(shapely.get_coordinates(simple)) != 5 or shapely.area(simple) < 0.9 * shapely.area(outline):
         simple = shapely.minimum_rotated_rectangle(outline)
@@ -115,10 +109,7 @@ def rectangle_corners(outline: shapely.Geometry) -> FloatArray:
 
 
 def to_rectangle(polygon: shapely.Geometry) -> shapely.Geometry:
-    """Turn a parallelogram into the rectangle along its longer sides with the same centre and area.
-
-    Polygons without exactly four corners are returned unchanged.
-    """
+    """Turn a parallelogram into the rectangle along its longer sides of the same area; others stay unchanged."""
     corners = shapely.get_coordinates(polygon)
     if len(corners) != 5:
         return polygon
@@ -146,7 +137,6 @@ def _refuse_drawn_twice(ids: Sequence[str], outlines: NDArray[np.object_], area:
 
 
 def without_overlaps(spaces: Spaces) -> Spaces:
-    """Narrow and shorten spaces that overlap others, by a few per cent at a time."""
     length, width = spaces.length.copy(), spaces.width.copy()
     for _ in range(6):
         boxes = replace(spaces, length=length, width=width).boxes(shrink=0.08)
@@ -161,8 +151,7 @@ def without_overlaps(spaces: Spaces) -> Spaces:
 
 TOUCHING = 0.7  # widest gap, m, between neighbours in a row
 SAME_AXIS = np.cos(np.radians(25.0))  # least |cosine| of the angle between the axes of neighbours
-STEP = 0.62
-"""Largest offset of neighbours along their axes, as a fraction of their length: 45° rows have 0.5."""
+STEP = 0.62  # largest offset of neighbours along their axes, as a fraction of their length: 45° rows have 0.5
 SLIM, KERB_LENGTH, KERB_SHAPE = 1.6, 4.9, 1.9
 """Least ratio of length to width of spaces end to end along a kerb; of just two of them, least length, m, and ratio."""
 SQUARE = np.radians(12.0)  # largest deviation from a right angle of a perpendicular row
@@ -184,7 +173,6 @@ class Row:
         return len(self.members)
 
     def part(self, index: IntArray) -> Row:
-        """Return the row of some of the spaces."""
         columns = {name: getattr(self, name)[index] for name in ("members", "along", "out", "half", "pitch")}
         return replace(self, **columns)
 
@@ -199,7 +187,6 @@ class Row:
         return self.out * (1.0 - 2.0 * side)
 
     def mouths(self, spaces: Spaces, side: int) -> FloatArray:
-        """Middles of the mouths, (k, 2) m."""
         return spaces.xy[self.members] + self.half[:, None] * self.outward(side)
 
     @property
@@ -356,7 +343,6 @@ class CenterRow:
 
     @property
     def spacing(self) -> float:
-        """Typical distance from space to space, m."""
         return float(np.median(self.gaps))
 
     def extent(self, most: float) -> FloatArray:
@@ -368,10 +354,7 @@ class CenterRow:
 def spaces_from_centers(
     ids: Sequence[str], xy: FloatArray, yaw: FloatArray | None
 ) -> tuple[Spaces, IntArray, list[CenterRow]]:
-    """Return the rectangles of spaces, the index of each in the list, and the rows of centres, (n, 2) m.
-
-    Centres in no row have no rectangle. `yaw`, (n,) rad, is the heading of a car parked nose-in.
-    """
+    """Return rectangles of the centres in rows, their indices, and the rows; `yaw`, (n,) rad, is of cars nose-in."""
     rows, strays = _find_rows(xy)
     if len(strays) > MOST_STRAYS * len(xy):
         shown = ", ".join(ids[i] for i in strays[:5])
@@ -400,14 +383,12 @@ def spaces_from_centers(
 
 
 def describe_rows(rows: Sequence[CenterRow]) -> str:
-    """Describe rows in a line: their number, lengths and spacing."""
     listed = ", ".join(str(len(row.members)) for row in rows[:12]) + (", ..." if len(rows) > 12 else "")
     spacing = [row.spacing for row in rows]
     return f"{len(rows)} rows of {listed} slots, a slot every {min(spacing):.2f} to {max(spacing):.2f} m"
 
 
 def _find_rows(xy: FloatArray) -> tuple[list[CenterRow], IntArray]:
-    """Return the rows of centres, (n, 2) m, and the indices of the centres in none."""
     if len(xy) < 4:
         raise InputError(f"{len(xy)} slots, want at least 4 to find rows")
     tree = cKDTree(xy)

@@ -35,11 +35,7 @@ class Area:
 
     @classmethod
     def of(cls, element: OsmElement, frame: LocalFrame, *, simple: bool) -> Area:
-        """Return the area of a closed element.
-
-        Outlines that cross themselves are refused if `simple`; otherwise, and if the edge of the map cuts them, they
-        are mended.
-        """
+        """Return the area of a closed element; outlines that cross themselves are refused if `simple`, else mended."""
         if not element.is_closed:
             raise InputError(f"{element.id}: its outline is open, want its first position again at the end")
         outer, holes = (
@@ -66,21 +62,16 @@ def areas_of(
     *,
     mended: bool = False,
 ) -> list[Area]:
-    """Return the areas of the closed ones among the wanted elements.
-
-    Outlines that cross themselves are mended but for those of parking spaces, or all with `mended`.
-    """
+    """Return the areas of the closed ones among the wanted elements, `mended` also where spaces cross themselves."""
     closed = (e for e in elements if wanted(e) and e.lines and e.is_closed and not e.is_node)
     return [Area.of(e, frame, simple=not mended and e.tags.get("amenity") == "parking_space") for e in closed]
 
 
 def is_building(element: OsmElement) -> bool:
-    """Whether an element is a building."""
     return element.tags.get("building", "no") != "no"
 
 
 def within(areas: Sequence[Area], box: tuple[float, float, float, float] | None) -> list[Area]:
-    """Return the areas in a box (least x and y, greatest x and y, m); all if it is None."""
     if box is None:
         return list(areas)
     bounds = shapely.box(*box)
@@ -88,7 +79,6 @@ def within(areas: Sequence[Area], box: tuple[float, float, float, float] | None)
 
 
 def exterior_rings(polygons: Iterable[shapely.Geometry]) -> list[FloatArray]:
-    """Return the outer outlines, (k, 2) m each, of polygons and their parts."""
     rings = [shapely.get_exterior_ring(part) for whole in polygons for part in shapely.get_parts(whole)]
     return [shapely.get_coordinates(ring) for ring in rings if ring is not None]
 
@@ -96,11 +86,7 @@ def exterior_rings(polygons: Iterable[shapely.Geometry]) -> list[FloatArray]:
 def find_goals(
     slots: Slots, nodes: Sequence[OsmElement], buildings: Sequence[Area], frame: LocalFrame
 ) -> tuple[FloatArray, str | None]:
-    """Return the goals, (n, 2) m, and a note that describes them.
-
-    Goals are the building entrances near the slots, main entrances first, or else the centre of the nearest building;
-    without either there are none.
-    """
+    """Return entrances near the slots, main ones first, else the middle of the nearest building, (n, 2) m; a note."""
     none = np.empty((0, 2))
     if not len(slots):
         return none, None
@@ -126,10 +112,7 @@ def find_goals(
 def split_walls(
     slots: Slots, roads: Sequence[Road], buildings: Sequence[Area]
 ) -> tuple[list[FloatArray], list[str]]:
-    """Return outlines, (k, 2) m each, of the buildings near the slots, and the ids of those over slots or lanes.
-
-    A building over a slot or a lane is not a wall: cars pass below it.
-    """
+    """Return outlines, (k, 2) m each, of buildings near the slots, and ids of those that cars pass below."""
     if not len(slots) or not buildings:
         return [], []
     polygons = np.array([a.polygon for a in buildings])
@@ -142,7 +125,6 @@ def split_walls(
 
 
 def _distance_to_slots(slots: Slots, geometries: NDArray[np.object_]) -> FloatArray:
-    """Return the distance, (n,) m, from each of n geometries to the nearest slot centre."""
     tree = shapely.STRtree(np.asarray(shapely.points(slots.xy)))
     (index, _), distance = tree.query_nearest(geometries, all_matches=False, return_distance=True)
     result = np.full(len(geometries), np.inf)
@@ -157,22 +139,17 @@ LARGEST_SPACE = 30.0
 
 
 def is_space(element: OsmElement) -> bool:
-    """Whether an element is a mapped parking space."""
     return element.tags.get("amenity") == "parking_space" and not element.is_node
 
 
 def is_parking_area(element: OsmElement) -> bool:
-    """Whether an element is a parking area as a whole."""
     return element.tags.get("amenity") == "parking"
 
 
 def usable_spaces(
     spaces: Sequence[Area], parking: Sequence[Area], *, with_disabled: bool
 ) -> tuple[list[Area], list[tuple[Area, str]]]:
-    """Return the spaces that are slots, and the others with the reasons.
-
-    Spaces in private parking areas are not slots.
-    """
+    """Return the spaces that are slots, and the others with the reasons."""
     private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
     reasons = [
         "spaces cut at the edge of the map"
@@ -191,7 +168,6 @@ def _why_no_slot(
     *,
     with_disabled: bool,
 ) -> str | None:
-    """Return the reason why a mapped space is not a slot; None for a slot."""
     kind = tags.get("parking_space", "normal")
     is_disabled = (
         kind == "disabled"
@@ -216,10 +192,7 @@ def _why_no_slot(
 def slots_by_rank(
     polygons: NDArray[np.object_], roads: Sequence[Road]
 ) -> Iterator[tuple[Rank, NDArray[np.intp], Slots]]:
-    """Yield the slots of outlines, (n,) polygons, that open to roads of each rank, and their indices.
-
-    A slot prefers an aisle to another service road, and that to a street, even if these are nearer.
-    """
+    """Yield slots by the rank of the road that they open to, with their indices; lower ranks win, even if farther."""
     left = np.arange(len(polygons))
     for rank in Rank:
         near = [Lane(road.points, road.oneway) for road in roads if road.rank <= rank]
@@ -237,10 +210,7 @@ def slots_by_rank(
 def split_space(
     element: OsmElement, polygon: shapely.Geometry, lanes: Sequence[Lane]
 ) -> list[tuple[str, shapely.Geometry]]:
-    """Split a space into as many equal ones as its capacity, and name them.
-
-    They are side by side along the lane nearest to the space, or along its longer side without lanes.
-    """
+    """Split a space into as many as its capacity, along its nearest lane or else its longer side, and name them."""
     count = whole_number(element.tags.get("capacity")) or 1
     if count == 1:
         return [(element.id, polygon)]

@@ -97,7 +97,6 @@ MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
 
 
 def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
-    """Draft a lot from an OpenStreetMap file; see the module for the rules."""
     path = Path(path)
     place = read_map(path)
     with naming(path):
@@ -111,7 +110,6 @@ def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraf
 
 
 def cut_elements(elements: Sequence[OsmElement]) -> Iterator[str]:
-    """Yield a line about the elements that the edge of the map cuts."""
     if cut := tuple(e.id for e in elements if e.cut):
         yield str(LeftOut("cut at the edge of the map", cut))
 
@@ -142,14 +140,12 @@ def draft_of_map(
 
 
 def map_frame(elements: Sequence[OsmElement]) -> LocalFrame:
-    """Return the frame around the parking of a map."""
     parking = [e for e in elements if _is_parking(e)]
     refuse_far_away(parking)
     return LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
 
 
 def _may_be_lane(element: OsmElement) -> bool:
-    """Whether an element is a road for cars."""
     if element.is_node or "highway" not in element.tags:
         return False
     return isinstance(road_of(element.id, element.tags, element.lines[0] * 1e5), Road)
@@ -172,7 +168,6 @@ class MapImport:
         self.nodes = [e for e in place.elements if e.is_node]
 
     def areas(self, wanted: Callable[[OsmElement], bool], *, mended: bool = False) -> list[Area]:
-        """Return the wanted elements that have an area."""
         areas = areas_of(self.place.elements, self.frame, wanted, mended=mended)
         if not mended:
             self.left_out["outlines without an area"] += [
@@ -181,7 +176,6 @@ class MapImport:
         return [a for a in areas if shapely.area(a.polygon) > 0.0]
 
     def points(self, wanted: Callable[[OsmElement], bool]) -> FloatArray:
-        """Return the positions of the wanted nodes, (n, 2) m."""
         positions = (e.lines[0] for e in self.nodes if wanted(e))
         return self.frame.to_xy(np.concatenate([np.empty((0, 2)), *positions]))
 
@@ -204,7 +198,6 @@ class MapImport:
         return parts, by_rank
 
     def all_left_out(self) -> list[LeftOut]:
-        """Return what is left out."""
         return [LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items() if ids]
 
 
@@ -248,7 +241,6 @@ class _LotImport(MapImport):
         self.blocked: list[shapely.Geometry] = [a.polygon for a in self.buildings]
 
     def _add_row(self, source: str, owner: str, start: str, slots: Slots, rank: Rank) -> None:
-        """Add the slots of one element, or of a part of it, numbered from 1."""
         first = self.rows[start] + 1
         self.rows[start] += len(slots)
         self.slots += [_Slot(source, owner, f"{start}-{first + k}", rank) for k in range(len(slots))]
@@ -257,7 +249,6 @@ class _LotImport(MapImport):
     # ---- slots ----
 
     def read_spaces(self) -> None:
-        """Create slots from mapped spaces."""
         usable, unused = usable_spaces(self.spaces, self.outlines, with_disabled=self.options.with_disabled)
         for area, reason in unused:
             self.left_out[reason].append(area.element.id)
@@ -269,7 +260,6 @@ class _LotImport(MapImport):
             self.parts.append(slots)
 
     def fill_outlines(self) -> None:
-        """Fill the parking areas without mapped spaces with rows of slots by rule."""
         centers = shapely.points(np.concatenate([np.empty((0, 2)), *(slots.xy for slots in self.parts)]))
         tree = shapely.STRtree([shapely.LineString(road.points) for road in self.roads])
         for area in self.outlines:
@@ -309,7 +299,6 @@ class _LotImport(MapImport):
                 self.notes.append(f"{name}: {len(slots)} of the tagged {capacity} slots fit by the rule")
 
     def line_kerbs(self) -> None:
-        """Create slots along streets."""
         if not any(road.has_kerb_parking for road in self.roads):
             return
         junctions = Junctions(self.roads, self.points(is_crossing))
@@ -342,7 +331,6 @@ class _LotImport(MapImport):
     # ---- the lot ----
 
     def draft(self) -> LotDraft:
-        """Assemble slots, lanes, entries, goals and walls, and list what is missing."""
         sources, slots = self._without_overlaps()
         lanes_of_streets = any(slot.rank == Rank.STREET for slot in sources)
         roads = self.roads
@@ -408,7 +396,6 @@ class _LotImport(MapImport):
         return [self.slots[i] for i in index.tolist()], slots[index]
 
     def _edge(self, slots: Slots) -> shapely.Geometry:
-        """Return the box within which streets are lanes."""
         if self.box is not None:
             return shapely.Polygon(shapely.box(*self.box))
         low, high = slots.xy.min(axis=0) - STREETS_AROUND, slots.xy.max(axis=0) + STREETS_AROUND
@@ -457,7 +444,6 @@ class _LotImport(MapImport):
 
 
 def is_crossing(element: OsmElement) -> bool:
-    """Whether an element is a pedestrian crossing."""
     return element.tags.get("highway") == "crossing"
 
 
@@ -491,8 +477,7 @@ def _is_blind_end(element: OsmElement) -> bool:
     return tags.get("noexit") == "yes" or tags.get("highway") in ("turning_circle", "turning_loop")
 
 
-MOST_SPACES = 20_000
-"""Maximum number of spaces of one lot."""
+MOST_SPACES = 20_000  # maximum number of spaces of one lot
 LARGEST_USUAL = 18.0  # area, m², that few parking spaces for cars exceed
 
 
@@ -569,10 +554,7 @@ def _refuse_swapped(areas: Sequence[Area]) -> None:
 
 
 def _plausibility(outlines: Sequence[FloatArray]) -> tuple[float, float]:
-    """Return the fraction of outlines, (k, 2) degrees, of a parked car's size, and their typical skew.
-
-    The skew is the cosine of the angle between two sides: 0 for a rectangle.
-    """
+    """Return the fraction of outlines, (k, 2) degrees, of a car's size, and their median skew: 0 for rectangles."""
     frame = LocalFrame.around(np.concatenate(outlines))
     fits, skew = [], []
     for outline in outlines:
@@ -593,8 +575,7 @@ SAME_CAR_PARK = 22.0
 """Distance, m, between spaces up to which they belong to one car park: a street with verges, or two aisles."""
 AROUND = 60.0  # distance, m, from the spaces of a car park within which roads and buildings belong to it
 LEAST_SPACES = 10  # number of spaces of the smallest car park, by default
-MOST_IN_TOWN = 300_000
-"""Maximum number of spaces in one file."""
+MOST_IN_TOWN = 300_000  # maximum number of spaces in one file
 
 
 @dataclass(frozen=True, eq=False)
@@ -629,7 +610,6 @@ def import_car_parks(
 def split_town(
     name: str, elements: Sequence[OsmElement], least: int
 ) -> Iterator[tuple[str, list[OsmElement]]]:
-    """Yield the name and the elements of each group of at least `least` spaces, the largest first."""
     spaces = [e for e in elements if is_space(e)]
     if not spaces:
         raise InputError("no amenity=parking_space in it, want their outlines to find car parks")

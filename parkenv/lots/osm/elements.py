@@ -60,7 +60,6 @@ class OsmElement:
 
     @property
     def is_node(self) -> bool:
-        """Whether it is a single position."""
         return len(self.lines[0]) == 1
 
     @property
@@ -94,10 +93,7 @@ class OsmMap:
     turns_left_out: tuple[LeftOut, ...] = ()  # restrictions of turns that are not read
 
     def within(self, bounds: tuple[tuple[float, float], tuple[float, float]]) -> OsmMap:
-        """Cut the map at a box: roads end there; everything else stays whole if half of its corners are inside.
-
-        The bounds are two corners, each a latitude and a longitude, degrees.
-        """
+        """Cut roads at a box, two corners of latitude and longitude; others need half of their corners inside."""
         corners = np.array(bounds)[:, ::-1]
         low, high = corners.min(axis=0), corners.max(axis=0)
         inside = [
@@ -127,7 +123,6 @@ class OsmMap:
 
 
 def read_map(path: Path) -> OsmMap:
-    """Read all tagged nodes, ways and multipolygons of a file, cut at the edge of the map."""
     if unpacked_path(path).suffix.lower() in (".pbf", ".osm", ".xml"):
         return _read_osm(path)
     content = read_json(path)
@@ -138,12 +133,10 @@ def read_map(path: Path) -> OsmMap:
 
 
 def place_name(path: Path) -> str:
-    """Return the name of a map by its file, such as `town` of `town.osm.pbf` and of `town.osm.gz`."""
     return unpacked_path(path).stem.removesuffix(".osm")
 
 
 def holds_osm(document: object) -> bool:
-    """Whether parsed JSON is GeoJSON made from OpenStreetMap, not a native lot."""
     features = document.get("features") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(features, list) or "parkenv" in document:
         return False
@@ -234,7 +227,6 @@ class _RawElements:
                 self.node_tags[node.id] = dict(node.tags)
 
     def map(self) -> OsmMap:
-        """Return the tagged elements with their references resolved, cut at the edge of the map."""
         nodes = [
             OsmElement(f"node/{i}", tags, (np.array([self.positions[i]]),))
             for i, tags in self.node_tags.items()
@@ -265,7 +257,6 @@ class _RawElements:
         return OsmMap(nodes + ways + areas, Positions(), left_out, tuple(turns), turns_left_out)
 
     def _turns(self, name: str, relation: _Relation) -> list[OsmTurn]:
-        """Return the turns of a restriction: from each of its ways, to each of them."""
         tags = relation.tags
         key = next((key for key in TURN_KEYS if key in tags), None)
         if key is None:
@@ -304,7 +295,6 @@ class _RawElements:
         return beside
 
     def _line_of(self, way: _Way) -> FloatArray:
-        """Return the positions of a way, (k, 2) degrees, NaN beyond the edge of the map."""
         return np.array([self.positions.get(ref, BEYOND) for ref in way.refs]).reshape(-1, 2)
 
     def _way(self, number: int, way: _Way) -> OsmElement | None:
@@ -343,7 +333,6 @@ def _is_ring(line: FloatArray) -> bool:
 
 
 def _runs(line: FloatArray) -> list[FloatArray]:
-    """Return the parts of a line of at least two positions within the edge of the map."""
     inside = ~np.isnan(line[:, 0])
     starts = np.flatnonzero(np.diff(np.r_[False, inside].astype(np.int8)) == 1)
     ends = np.flatnonzero(np.diff(np.r_[inside, False].astype(np.int8)) == -1) + 1
@@ -351,7 +340,6 @@ def _runs(line: FloatArray) -> list[FloatArray]:
 
 
 def _joined(lines: Sequence[FloatArray]) -> list[FloatArray]:
-    """Join lines that meet end to end."""
     if not lines:
         return []
     joined = shapely.line_merge(shapely.MultiLineString([line.tolist() for line in lines]))
@@ -381,7 +369,6 @@ def _position(name: str, lat: object, lon: object) -> tuple[float, float]:
 
 
 def _read_osm(path: Path) -> OsmMap:
-    """Read the parking, roads, buildings and entrances of a map in XML or PBF."""
     with naming(path), with_extra("OpenStreetMap", "osm"):
         import osmium
     require_file(path)
@@ -417,7 +404,6 @@ def _read_osm(path: Path) -> OsmMap:
 
 
 def _map_of_geojson(features: list[Any], positions: Positions) -> OsmMap:
-    """Return the map of GeoJSON with positions that are yet to be converted."""
     to_lonlat = positions.to_lonlat if positions.converts else None
     elements: dict[str, tuple[int, OsmElement]] = {}
     for index, feature in enumerate(features):

@@ -90,7 +90,6 @@ class Road:
 
     @property
     def tagged_limit(self) -> float | None:
-        """The speed limit that the tags say, km/h; None without one that can be read."""
         text = self.tags.get("maxspeed", "").strip()
         match = re.fullmatch(r"(\d{1,3})(?: ?(mph|km/h|kmh))?", text)
         if match is None:
@@ -99,7 +98,6 @@ class Road:
 
     @property
     def limit(self) -> float:
-        """The speed limit, km/h: as tagged, else that of the class."""
         usual = (
             _AISLE_LIMIT if self.rank is Rank.AISLE else LIMITS[self.tags["highway"].removesuffix("_link")]
         )
@@ -154,7 +152,6 @@ def road_of(
 def read_roads(
     elements: Iterable[OsmElement], frame: LocalFrame, left_out: dict[str, list[str]], *, town: bool = False
 ) -> list[Road]:
-    """Return the roads of a map, and list by reason those that cars may not drive; see `road_of`."""
     roads: list[Road] = []
     for element in elements:
         if element.is_node or "highway" not in element.tags:
@@ -199,22 +196,17 @@ def metres(text: str | None) -> float | None:
 
 
 def whole_number(text: str | None) -> int | None:
-    """Parse a count, also of texts such as `> 110`, `50+`, `ca. 60` and `1,500`; the middle of `20-30`.
-
-    Returns None for anything else.
-    """
+    """Parse a count, also of texts such as `> 110`, `50+`, `ca. 60` and `1,500`; the middle of `20-30`; else None."""
     plain = re.sub(r"(?<=\d)[,. ](?=\d{3}(?!\d))", "", (text or "").strip())
     match = re.fullmatch(r"[^\d-]{0,5}(\d{1,5})(?:\s*[-–]\s*(\d{1,5}))?\D{0,10}", plain)
     return (int(match[1]) + int(match[2] or match[1])) // 2 if match else None
 
 
 def lanes_of(roads: Sequence[Road]) -> list[Lane]:
-    """Return one lane per road."""
     return [Lane(road.points, road.oneway) for road in roads]
 
 
 def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
-    """Return the parts of a road within a box, each in the direction of the road."""
     line = shapely.LineString(road.points)
     if shapely.covers(box, line):
         return [road]
@@ -229,10 +221,7 @@ def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
 
 
 def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> list[Road]:
-    """Return the roads connected to slots, without service roads that do not lead to a slot.
-
-    A road that meets one of those around is not a dead end.
-    """
+    """Return the roads connected to slots, without service roads that lead neither to a slot nor to one `around`."""
     parts = components_with_slots(roads, slots)
     kept = [road for part in parts for road in part]
     serving = _serving_roads(kept, slots)
@@ -249,11 +238,7 @@ def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> l
 
 
 def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) -> FloatArray:
-    """Return the points where streets leave the map and cars may enter, (n, 2) m.
-
-    These are the road ends at the edge of the map or, if no road ends there, all ends that are not dead ends: `blind`,
-    (k, 2) m, are those tagged so.
-    """
+    """Return ends of streets at the edge of the map, (n, 2) m, else all but `blind` ones: there cars may enter."""
     ends = [
         xy
         for road, xy, is_first in road_ends(roads)
@@ -280,7 +265,6 @@ def _road_nodes(roads: Sequence[Road]) -> list[NDArray[np.int64]]:
 
 
 def _serving_roads(roads: Sequence[Road], slots: Slots) -> set[int]:
-    """Return the indices of the roads that are nearest to the mouth of some slot."""
     if not roads or not len(slots):
         return set()
     lines = np.array([shapely.LineString(road.points) for road in roads])
@@ -289,7 +273,6 @@ def _serving_roads(roads: Sequence[Road], slots: Slots) -> set[int]:
 
 
 def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road]]:
-    """Return the connected components of the roads, without those that serve no slot."""
     if not roads:
         return []
     along = _road_nodes(roads)
@@ -302,7 +285,6 @@ def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road
 
 
 def _shared_node_counts(roads: Sequence[Road], around: Sequence[Road]) -> list[int]:
-    """Count the nodes that each road shares with other roads of either list."""
     along = [set(p.tolist()) for p in _road_nodes([*roads, *around])]
     users: dict[int, int] = {}
     for labels in along:
@@ -328,7 +310,6 @@ def street_junctions(roads: Sequence[Road], streets: Sequence[Road]) -> FloatArr
 
 
 def dead_ends(roads: Sequence[Road]) -> FloatArray:
-    """Return the road ends, (n, 2) m, at which no other road begins."""
     return np.array([xy for _, xy, _ in road_ends(roads)]).reshape(-1, 2)
 
 
@@ -398,14 +379,12 @@ def turns_of(
 
 
 def _arms_at(lanes: Sequence[Lane], at: FloatArray) -> IntArray:
-    """Return how many stretches of lanes meet at points, (n,)."""
     arms = np.concatenate([np.r_[1, np.full(len(lane.points) - 2, 2), 1] for lane in lanes])
     near = cKDTree(np.concatenate([lane.points for lane in lanes])).query_ball_point(at, NODE_TOLERANCE)
     return np.array([arms[those].sum() for those in near], np.int64)
 
 
 def _reasons(lanes: Sequence[Lane], turns: Sequence[Turn], split: Sequence[bool]) -> list[str]:
-    """Return why each turn cannot be kept, empty where it can."""
     chains = centrelines([(lane.points, lane.oneway, lane.speed) for lane in lanes]).chains
     rules = rules_of(chains, [(turn.points, turn.only) for turn in turns])
     why = [

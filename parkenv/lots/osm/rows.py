@@ -34,7 +34,6 @@ class Arrangement:
 
     @property
     def pitch(self) -> float:
-        """Distance from one slot to the next along the road, m."""
         return self.length if self.angle == 0.0 else self.width / float(np.sin(self.angle))
 
 
@@ -70,10 +69,7 @@ def row_anchors(points: FloatArray, stations: FloatArray, pitch: float, side: Si
 
 
 def row_at(anchors: RowAnchors, offset: FloatArray | float, how: Arrangement, *, with_points: bool) -> Slots:
-    """Create the slots of a row, their near edge `offset` m, (n,) or scalar, from the centre line.
-
-    `with_points`: whether cars pass the row in the order of the road's points.
-    """
+    """Create a row, its near edge `offset` m from the centre line; cars pass it `with_points` or against them."""
     heading = anchors.along if with_points else -anchors.along
     outward = anchors.outward
     reach = np.broadcast_to(np.asarray(offset, dtype=np.float64), len(outward))[:, None]
@@ -96,10 +92,7 @@ def row_at(anchors: RowAnchors, offset: FloatArray | float, how: Arrangement, *,
 
 
 def bend_factor(points: FloatArray, start: float, end: float, side: Side, reach: float) -> float:
-    """Return the length ratio of a part of a road to its parallel `reach` m to a side; at least 1.
-
-    On the inside of a bend, slots need more room along the road by this factor.
-    """
+    """Return how much more of the road, at least 1, slots need on the inside of a bend, `reach` m beside it."""
     n = max(int((end - start) / 2.0), 2)
     step = (end - start) / n
     stations = np.asarray(start + (np.arange(n) + 0.5) * step, dtype=np.float64)
@@ -233,7 +226,6 @@ def free_intervals(total: float, closed: Sequence[tuple[float, float]]) -> list[
 def _distribute(
     capacity: int, free: Sequence[tuple[float, float]], fit: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Distribute `capacity` slots over the intervals, at most `fit` in each, more in longer ones."""
     count = np.zeros(len(fit), dtype=np.int64)
     length = np.array([end - start for start, end in free])
     for _ in range(min(capacity, int(fit.sum()))):
@@ -346,7 +338,6 @@ def fill_outline(
 
 
 def _intervals(line: shapely.LineString, outline: shapely.Geometry) -> list[tuple[float, float]]:
-    """Return the parts of a road that pass the outline, start and end in m from its start."""
     parts = shapely.get_parts(shapely.intersection(line, shapely.buffer(outline, SLOT_REACH)))
     ends = [
         sorted(line.project(shapely.Point(xy)) for xy in shapely.get_coordinates(part)[[0, -1]])
@@ -360,7 +351,6 @@ def _intervals(line: shapely.LineString, outline: shapely.Geometry) -> list[tupl
 def _row(
     road: Road, side: Side, start: float, end: float, how: Arrangement, outline: shapely.Geometry
 ) -> Slots:
-    """Return all slots between two stations of a road, as close to it as road and outline allow."""
     n = max(int((end - start + DRAWN) / how.pitch), 0)
     stations = np.asarray(start + (np.arange(n) + 0.5) * how.pitch, dtype=np.float64)
     anchors = row_anchors(road.points, stations, how.pitch, side)
@@ -375,7 +365,6 @@ def _row(
 def _fitting(
     slots: Slots, roomy: shapely.Geometry, taken: shapely.Geometry, lines: NDArray[np.object_], own: int
 ) -> Slots:
-    """Return the slots that are inside the outline, clear of everything else, and open to their own road."""
     if not len(slots):
         return slots
     boxes = slots.boxes(shrink=0.02)

@@ -154,7 +154,6 @@ def _sources(
 
 
 def _point_of(tags: Mapping[str, str]) -> tuple[float, dict[str, float]] | None:
-    """Return the nominal floor of a point of interest and whom it attracts; None if it attracts nobody."""
     if found := POINTS.get(tags.get("amenity", "")):
         return found
     for key in ("shop", "office", "craft", "healthcare", "tourism", "leisure"):

@@ -169,7 +169,6 @@ class _TownImport(MapImport):
         self.listed: list[str] = []  # which facilities car parks of a list are
 
     def _is_open(self, element: OsmElement) -> bool:
-        """Whether any car in town may use a car park; else it is listed."""
         tags = element.tags
         reason = f"access={tags['access']}" if tags.get("access") in CLOSED else None
         if tags.get("parking") in ("construction", "disused", "abandoned"):
@@ -179,7 +178,6 @@ class _TownImport(MapImport):
         return reason is None
 
     def _named(self, tags: Any, element_id: str) -> str:
-        """Return a name that no other facility has."""
         name = str(tags.get("name", ""))
         name = name if name and is_plain(name) else element_id
         if name in self.names:
@@ -232,7 +230,6 @@ class _TownImport(MapImport):
             self.rows.append(row)
 
     def _owners(self, polygons: Any) -> Any:
-        """Return the car park around each space, or a number beyond those for a group of spaces near each other."""
         near = shapely.STRtree(polygons).query(polygons, predicate="dwithin", distance=SAME_CAR_PARK)
         owner = len(self.parking) + component_labels(near.T, len(polygons))
         if self.parking:
@@ -283,7 +280,6 @@ class _TownImport(MapImport):
         self.rows += [row for row in rows if len(row.slots)]
 
     def read_counted(self) -> None:
-        """Read the car parks and garages whose places are counted."""
         ways_in = [e for e in self.nodes if e.tags.get("amenity") == "parking_entrance"]
         entrances = [self.frame.to_xy(e.lines[0])[0] for e in ways_in]
         points = [
@@ -356,7 +352,6 @@ class _TownImport(MapImport):
     def _entrance(
         self, shape: shapely.Geometry, entrances: Sequence[FloatArray]
     ) -> tuple[float, float] | None:
-        """Return where a facility is entered; None if no street is near."""
         if entrances:
             away = shapely.distance(shape, shapely.points(np.array(entrances)))
             if away.min() <= ENTRANCE_WITHIN:
@@ -368,7 +363,6 @@ class _TownImport(MapImport):
         return float(at[0]), float(at[1])
 
     def draft(self) -> TownDraft:
-        """Assemble lanes, slots, facilities, zones, entries and goals."""
         if not self.rows:
             raise InputError("no parking in it: no kerb, no car park and no garage beside its streets")
         parts = [row.slots for row in self.rows]

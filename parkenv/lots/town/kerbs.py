@@ -48,8 +48,7 @@ METRES_PER_PLACE = {"parallel": 5.4, "diagonal": 3.1, "perpendicular": 2.6}
 """Kerb taken by a place, m, by orientation; from the same kerbs."""
 STRIPS = ("street_side", "lane", "on_kerb", "half_on_kerb", "shoulder")
 """Values of `parking` of areas that are kerbs."""
-CLASS_RULE = "class of street"
-"""Name of the rule of kerbs that the map says nothing of."""
+CLASS_RULE = "class of street"  # name of the rule of kerbs that the map says nothing of
 HOUSES_WITHIN = 40.0  # m; where no building is this near, an untagged street has no places
 STATION = 20.0  # m, between the points of a street at which buildings are looked for
 STRIP_REACH = 20.0  # largest distance, m, of a drawn kerb from its street
@@ -115,10 +114,7 @@ def kerb_sides(
 
 
 def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> FacilityRow | None:
-    """Return the kerb that is drawn as an area, under its name.
-
-    None if it is not along one of the roads in the tree.
-    """
+    """Return the kerb that is drawn as an area, under its name; None if it is not along a road of the tree."""
     tags = area.element.tags
     (index, distance) = tree.query_nearest(area.polygon, return_distance=True, all_matches=False)
     if not len(index) or distance[0] > STRIP_REACH:
@@ -149,7 +145,6 @@ def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> Faci
 
 
 def _is_half(road: Road) -> bool:
-    """Whether a road is one half of a dual carriageway."""
     return road.oneway and road.tags["highway"] in ("primary", "secondary", "tertiary")
 
 

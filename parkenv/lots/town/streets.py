@@ -107,22 +107,18 @@ class Streets:
         return csr_array((np.ones(len(source)), (source, target)), shape=(n, n))
 
     def _parts(self, connection: Literal["weak", "strong"]) -> IntArray:
-        """Label the junctions by the part of the network that they belong to."""
         return np.asarray(connected_components(self._graph(), connection=connection)[1], np.int64)
 
     @property
     def oneway(self) -> BoolArray:
-        """Whether each piece is one-way, (n,) bool."""
         return np.array([road.oneway for road in self.roads])[self.road]
 
     def points(self, piece: int) -> FloatArray:
-        """Return the points of a piece, (k, 2) m."""
         first, last = self.span[piece].tolist()
         points: FloatArray = self.roads[self.road[piece]].points[first : last + 1]
         return points
 
     def connected_share(self) -> float:
-        """Return the share of the drivable length that is in one part, 0 to 1."""
         real = ~self._is_beyond
         return float(self.length[self.kept & real].sum() / self.length[real].sum())
 
@@ -216,10 +212,7 @@ class Streets:
                 yield node, int(to[away.argmin()])
 
     def entries(self) -> tuple[FloatArray, FloatArray]:
-        """Return where cars come in from beyond the map, (n, 2) m, and how much traffic each street brings, (n,).
-
-        From a one-way street that is not connected, cars come in where it meets the connected part.
-        """
+        """Return where cars come in, or reach the connected part, (n, 2) m, and how much traffic each brings, (n,)."""
         traffic, enters, _ = self._edge()
         inside = np.zeros(len(self.node_xy), bool)
         inside[self.nodes[self.kept].ravel()] = True
@@ -244,7 +237,6 @@ class Streets:
         return self.node_xy[nodes], np.array([brought[node] for node in nodes])
 
     def roads_kept(self) -> list[Road]:
-        """Return the connected part as roads, each a run of pieces of one way."""
         return [replace(self.roads[k], points=points) for k, points in self._runs(self.kept, set())]
 
     def lanes(self, mouths: FloatArray, entries: FloatArray | None = None) -> tuple[list[Lane], list[Lane]]:
@@ -303,7 +295,6 @@ class Streets:
         return wanted
 
     def tagged_limits(self) -> float:
-        """Return the share of the streets whose speed limit is tagged, by length, 0 to 1."""
         known = np.array([road.tagged_limit is not None for road in self.roads])[self.road]
         is_street = np.array([road.rank is Rank.STREET for road in self.roads])[self.road] & ~self._is_beyond
         return float(self.length[known & is_street].sum() / max(self.length[is_street].sum(), 1e-9))
@@ -351,7 +342,6 @@ class Streets:
 
 
 def _speed(road: Road) -> float:
-    """Return the speed of a road's lanes, a multiple of the scenario's."""
     return round(float(np.clip(road.limit / BASE_LIMIT, *SPEEDS)), 3)
 
 

@@ -82,7 +82,6 @@ class Rules:
 
 
 def rules_of(tags: Mapping[str, str]) -> Rules:
-    """Return the rules of a car park, a garage or a drawn space."""
     users = RESERVED.get(tags.get("parking_space", ""), RESERVED.get(tags.get("access", ""), PUBLIC))
     rules = _rules(
         users, tags.get("fee"), tags.get("charge"), tags.get("fee:conditional"), tags.get("maxstay")
@@ -91,8 +90,6 @@ def rules_of(tags: Mapping[str, str]) -> Rules:
 
 
 def kerb_rules(tags: Mapping[str, str], side: Side) -> Rules:
-    """Return the rules of one side of a street, of either tagging scheme."""
-
     def tag(key: str) -> str | None:
         return tags.get(key.format(side), tags.get(key.format("both")))
 
@@ -164,7 +161,6 @@ def _known_hours(text: str | None) -> str:
 
 
 def zones_of(used: Iterable[tuple[str, Rules]]) -> dict[str, Zone]:
-    """Return the zones of kinds of facilities with their rules, by name."""
     zones = (rules.zone(kind) for kind, rules in dict.fromkeys(used))
     return {zone.name: zone for zone in zones}
 
@@ -198,8 +194,7 @@ KINDS = {
     **{"underground": "underground", "multi-storey": "multi-storey", "rooftop": "rooftop"},
 }
 """Rule for each value of `parking`; `surface` for others."""
-GARAGES = ("underground", "multi-storey", "rooftop")
-"""Rules of what is a garage: it has a barrier and ramps."""
+GARAGES = ("underground", "multi-storey", "rooftop")  # rules of what is a garage: it has a barrier and ramps
 
 
 def rule_of(tags: Mapping[str, str]) -> str:
@@ -210,7 +205,6 @@ def rule_of(tags: Mapping[str, str]) -> str:
 
 
 def levels_of(tags: Mapping[str, str]) -> float | None:
-    """Return the tagged number of levels; None without one."""
     for key in ("parking:levels", "building:levels", "levels"):
         match = re.fullmatch(r"\s*(\d{1,2})(?:\.\d+)?\s*", tags.get(key, ""))
         if match and int(match[1]):
@@ -256,7 +250,6 @@ class FacilityRow:
 
 
 def facilities_of(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
-    """Yield the facilities of a row of the table: one for drawn slots, one for each counted part."""
     if len(row.slots) and row.name in filled:
         yield Facility(row.name, row.kind, row.rules.zone(row.kind).name)
     for name, capacity, rules in row.counted if row.xy is not None else ():
@@ -273,7 +266,6 @@ def facilities_of(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
 
 
 def table_of(rows: Sequence[FacilityRow], draft: LotDraft) -> list[dict[str, Any]]:
-    """Return the table of facilities, those of the draft."""
     names, count = np.unique(draft.slots.facility, return_counts=True)
     slots = dict(zip(names.tolist(), count.tolist(), strict=True))
     counted = {facility.name: facility.capacity for facility in draft.facilities}
