@@ -7,16 +7,12 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 
-def rgb(color):
-    """A colour of Matplotlib or RGB as three numbers of 0..255."""
-    return np.round(255 * np.array(to_rgb(color))) if isinstance(color, str) else np.array(color)
-
-
 def share_of_color(picture, color, within=6):
-    """Share of the pixels of a picture, an array or a file, that have a colour."""
+    """Share of the pixels of a picture, an array or a file, that have a colour, of Matplotlib or RGB."""
     if isinstance(picture, Path):
         picture = np.asarray(Image.open(picture).convert("RGB"))
-    return float((np.abs(picture.astype(int) - rgb(color)).max(axis=-1) <= within).mean())
+    rgb = np.round(255 * np.array(to_rgb(color))) if isinstance(color, str) else np.array(color)
+    return float((np.abs(picture.astype(int) - rgb).max(axis=-1) <= within).mean())
 
 
 def shows_color(picture, color, within=6):

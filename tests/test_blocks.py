@@ -10,9 +10,9 @@ from small_lots import driven, features
 from parkenv import ParkingLot, fleet
 from parkenv.engine.records import STATES
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.show.report.town_map import town_data
 from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, NOWHERE, Blocks
 from parkenv.studies.fleet.day import ALL
+from parkenv.studies.fleet.day_map import town_data
 from parkenv.world.facility import Facility
 
 
@@ -153,8 +153,7 @@ def test_a_counted_facility_is_a_block_of_its_capacity_and_a_square_at_its_place
     blocks = Blocks.of(lot)
     assert blocks.names == ("other (garage)", "other (zone)")
     assert blocks.slots.tolist() == [600, 10]
-    about = [{"name": name} for name in blocks.names]
-    square, slots = town_data(lot, about, blocks.of_slot)["blocks"]
+    square, slots = town_data(lot, ["", ""])["blocks"]
     assert square["at"] == [30.0, 12.0]
     corners = np.array(square["areas"][0][0]).reshape(-1, 2)
     np.testing.assert_allclose(corners.mean(axis=0), garage.xy)

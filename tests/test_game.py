@@ -57,13 +57,10 @@ def scores(game, tmp_path_factory):
     return {"format": "parkenv-scores", "version": 1, "scenario": "mini", "worlds": worlds}
 
 
-def changed(scores, **change):
-    """The scores with another first world."""
-    return scores | {"worlds": [scores["worlds"][0] | change, *scores["worlds"][1:]]}
-
-
-def saved(scores, folder):
-    (folder / "scores.json").write_text(json.dumps(scores))
+def saved(scores, folder, **change):
+    """An agent that repeats the scores, with another first world if wanted."""
+    first, *others = scores["worlds"]
+    (folder / "scores.json").write_text(json.dumps(scores | {"worlds": [first | change, *others]}))
     return f"human:{folder / 'scores.json'}"
 
 
@@ -93,11 +90,11 @@ def random_searches(scenario, seeds, limit=2_000):
     ]
 
 
-def require_equal(searches, found):
-    for (_, (actions, total_s, vertex, p_occupied)), its in zip(searches, found, strict=True):
-        assert its["total_s"] == pytest.approx(total_s, abs=1e-9)
-        assert (its["vertex"], its["steps"], its["over"]) == (vertex, len(actions), True)
-        assert its["belief"] == pytest.approx(p_occupied, abs=1e-6)
+def require_equal(searches, states):
+    for (_, (actions, total_s, vertex, p_occupied)), state in zip(searches, states, strict=True):
+        assert state["total_s"] == pytest.approx(total_s, abs=1e-9)
+        assert (state["vertex"], state["steps"], state["over"]) == (vertex, len(actions), True)
+        assert state["belief"] == pytest.approx(p_occupied, abs=1e-6)
 
 
 @pytest.mark.skipif(NODE is None, reason="node is not installed")
@@ -143,19 +140,15 @@ def test_the_next_changes_of_slots_are_found_to_the_last_bit(kind):
     assert np.array_equal(found, World.next_change(world, slots, begin, begin + 7_200.0))
 
 
-def compared(agents, out, *more):
-    """Return the summary of a comparison in three searches on `mini`."""
-    ran(
-        "compare", "--scenario", "mini", "--seed", "4", "-n", "3", "--agents", agents, "--jobs", "1", "--no-figures",
-        *more, "--out", out,
-    )  # fmt: skip
-    return summary_of(out)
-
-
 def test_scores_are_a_row_of_a_comparison(scores, tmp_path):
     agents = f"belief,{saved(scores, tmp_path)},oracle"
-    out = tmp_path / "compared"
-    summary = compared(agents, out)
+    ran(
+        "compare --scenario mini --seed 4 -n 3 --jobs 1 --no-figures --agents",
+        agents,
+        "--out",
+        tmp_path / "out",
+    )
+    summary = summary_of(tmp_path / "out")
     belief, human, _ = summary["rows"]
     assert human["agent"] == agents.split(",")[1]
     assert human["total_s"] == belief["total_s"]
@@ -164,27 +157,19 @@ def test_scores_are_a_row_of_a_comparison(scores, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "field"),
+    ("options", "change", "field"),
     [
-        (["--scenario", "campus", "--seed", "4", "-n", "3"], "scenario is 'mini'"),
-        (["--scenario", "mini", "--seed", "4", "-n", "4"], "--episodes"),
-        (["--scenario", "mini", "--seed", "3", "-n", "3"], "--seed"),
-        (["--scenario", "mini", "--seed", "4", "-n", "3", "--v-drive-kmh", "12"], "total_s"),
+        ("--scenario campus --seed 4 -n 3", {}, "scenario is 'mini'"),
+        ("--scenario mini --seed 4 -n 4", {}, "--episodes"),
+        ("--scenario mini --seed 3 -n 3", {}, "--seed"),
+        ("--scenario mini --seed 4 -n 3 --v-drive-kmh 12", {}, "total_s"),
+        ("--scenario mini --seed 4 -n 3", {"total_s": 1.0}, "total_s is 1.0"),
     ],
 )
-def test_scores_of_another_game_are_refused_in_a_line(scores, tmp_path, options, field):
-    require_refused(["compare", *options, "--agents", f"mdp,{saved(scores, tmp_path)}"], field, tmp_path)
-
-
-def test_a_time_that_the_actions_do_not_take_is_refused(scores, tmp_path):
-    agents = f"mdp,{saved(changed(scores, total_s=1.0), tmp_path)}"
-    command = ["compare", "--scenario", "mini", "--seed", "4", "-n", "3", "--agents", agents]
-    require_refused(command, "total_s is 1.0", tmp_path)
-
-
-def require_refused(command, field, folder):
-    assert field in refused(*command, "--out", folder / "compared")
-    assert not (folder / "compared").exists()
+def test_scores_of_another_game_are_refused_in_a_line(scores, tmp_path, options, change, field):
+    agents = f"mdp,{saved(scores, tmp_path, **change)}"
+    assert field in refused("compare", *options.split(), "--agents", agents, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -196,16 +181,16 @@ def require_refused(command, field, folder):
 )  # fmt: skip
 def test_damaged_scores_are_refused(scores, tmp_path, change, field):
     with pytest.raises(InputError, match=field):
-        make_agent(saved(changed(scores, **change), tmp_path), make_scenario("mini"))
+        make_agent(saved(scores, tmp_path, **change), make_scenario("mini"))
 
 
 def test_the_page_searches_as_python_does(browser, game):
     screen(browser, 1280, 800)
     browser.get(game.as_uri())
     searches = random_searches(make_scenario("mini"), [world["seed"] for world in data_of(game)["worlds"]])
-    found = browser.execute_script(
+    taken = browser.execute_script(
         "return arguments[0].map(([w, actions]) => game.take(w, actions))",
         [[w, its[0]] for w, its in searches],
     )
-    require_equal(searches, found)
+    require_equal(searches, taken)
     assert browser.get_log("browser") == []

@@ -111,7 +111,8 @@ def test_figures_have_one_style_whatever_the_users_settings_are(tmp_path):
     import numpy as np
 
     from parkenv import make_scenario
-    from parkenv.show.figures.forecast import CarParkDays, save_counted_demand, save_rates
+    from parkenv.show.figures.fleet import CarParkDays, save_counted_demand
+    from parkenv.show.figures.forecast import save_rates
     from parkenv.show.figures.lot import save_lot_picture
 
     scenario, days = (

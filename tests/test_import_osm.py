@@ -23,8 +23,7 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import import_lot
 from parkenv.lots.osm import elements
 from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.show.figures.lot_import import SOURCE_COLORS
-from parkenv.show.figures.schematic import TWO_WAY
+from parkenv.show.figures.lots import SOURCE_COLORS, TWO_WAY
 from parkenv.world.drive_graph import SLOT_REACH
 
 

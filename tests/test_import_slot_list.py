@@ -18,7 +18,7 @@ from parkenv.lots.generators import BAY_SIZE, Slots, bay_row
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.show.figures.lot_import import SOURCE_COLORS, save_import_picture
+from parkenv.show.figures.lots import SOURCE_COLORS, save_import_picture
 from parkenv.studies.compare.cases import Case
 from parkenv.world.lot import Mouth, mouth_points
 

@@ -17,23 +17,19 @@ from parkenv.world.lot import PARK, Lane, ParkingLot
 from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 
 
-def row_lot(goal=(40.0, 0.0), vertical=False):
+def row_lot(vertical=False):
     """Ten slots of 2.5 m by 5 m north of a lane; or east of it, where it runs north."""
-    x = 5.0 + 2.5 * np.arange(10)
-    xy, yaw, lane = np.stack([x, np.full(10, 5.5)], axis=1), np.pi / 2, [[0.0, 0.0], [35.0, 0.0]]
-    if vertical:
-        xy, yaw, lane, goal = xy[:, ::-1], 0.0, [p[::-1] for p in lane], goal[::-1]
+    xy, lane, goal = (
+        np.stack([5.0 + 2.5 * np.arange(10), np.full(10, 5.5)], axis=1),
+        [[0, 0], [35, 0]],
+        (40, 0),
+    )
+    turn = slice(None, None, -1 if vertical else 1)
+    ids, yaw = tuple(f"A{i}" for i in range(10)), np.full(10, 0.0 if vertical else np.pi / 2)
+    size = np.full(10, 5.0), np.full(10, 2.5), np.zeros(10)
+    lanes = (Lane(np.array(lane, float)[:, turn]),)
     return ParkingLot(
-        "row",
-        tuple(f"A{i}" for i in range(10)),
-        xy,
-        np.full(10, yaw),
-        np.full(10, 5.0),
-        np.full(10, 2.5),
-        np.zeros(10),
-        (Lane(np.array(lane)),),
-        np.array([[0.0, 0.0]]),
-        np.array([goal]),
+        "row", ids, xy[:, turn], yaw, *size, lanes, np.zeros((1, 2)), np.array([goal], float)[:, turn]
     )
 
 
@@ -175,7 +171,7 @@ def test_text_tells_place_time_and_surroundings():
     assert sum(marks.count(m) for m in "o#.:%") == 10
 
 
-def test_window(monkeypatch):
+def test_a_window_shows_frames_and_without_pygame_says_what_to_install(monkeypatch):
     import pygame
 
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -187,9 +183,6 @@ def test_window(monkeypatch):
     window.close()
     window.close()
     assert not pygame.display.get_init()
-
-
-def test_a_window_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(gym.error.DependencyNotInstalled, match=r"pip install 'parkenv\[human\]'"):
         check_env(gym.make("parkenv/Search-v2", scenario="mini").unwrapped)

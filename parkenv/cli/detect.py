@@ -262,7 +262,7 @@ class EvaluateDetector(Command):
         from parkenv.files.atomic_write import make_folder
         from parkenv.perception.car_datasets import read_crop_folder
         from parkenv.perception.detection_scores import recall_on_crops, score_on_uiuc
-        from parkenv.show.figures.detectors import save_curves
+        from parkenv.show.figures.survey import save_recall_precision
 
         detector, console = self._detector(), make_console()
         if self.crops is not None:
@@ -290,7 +290,7 @@ class EvaluateDetector(Command):
                 scores = score_on_uiuc(detector, self.uiuc, on_image=counted(progress, "Detecting"))
             rows = [score.row for score in scores]
             print_rows(console, "UIUC", rows)
-            save_curves(scores, self.detector or self.model, self.out / "recall_precision.png")
+            save_recall_precision(scores, self.detector or self.model, self.out / "recall_precision.png")
         save_summary(self.out, None, rows)
         console.print(f"Written: {self.out / 'summary.json'}")
 

@@ -306,8 +306,7 @@ class Import(Command):
         _print_each(console, "guessed", draft.guesses, "cyan")
         _print_each(console, "left out", draft.left_out, "yellow")
         if self.picture is not None:
-            from parkenv.show.figures.lot_import import save_import_picture
-            from parkenv.show.figures.town_import import save_town_picture
+            from parkenv.show.figures.lots import save_import_picture, save_town_picture
 
             if town is not None:
                 save_town_picture(town, self.picture)

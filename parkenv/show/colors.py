@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,14 +53,12 @@ FREE: Color = BELIEF_ANCHORS[0]
 _PALENESS = 0.62
 
 
-def rgb(color: str | Color) -> Color:
+def rgb(color: Any) -> Color:
     """Return a colour of `PALETTE`, of "#rrggbb" or of three numbers as red, green and blue, 0..255."""
-    if not isinstance(color, str):
-        return color
-    if color.startswith("#"):
-        red, green, blue = bytes.fromhex(color[1:])
-        return red, green, blue
-    return PALETTE[color]
+    if isinstance(color, str) and not color.startswith("#"):
+        return PALETTE[color]
+    red, green, blue = bytes.fromhex(color[1:]) if isinstance(color, str) else map(int, color)
+    return red, green, blue
 
 
 def hex_color(name: str) -> str:

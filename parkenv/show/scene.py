@@ -86,6 +86,13 @@ class Marks:
     edge_px: float = 1.5
     opacity: float = 1.0
 
+    def sizes(self, scale: float, least: float) -> FloatArray:
+        """Return length and width of each, (n, 2), at a scale and of a least length."""
+        size = scale * np.broadcast_to(np.asarray(self.size, dtype=np.float64), (len(self.poses), 2))
+        long = size[:, :1]
+        # Shapes without a size of their own are as wide as long.
+        return np.where(long > 0.0, size * np.maximum(1.0, least / np.maximum(long, 1e-9)), least)
+
 
 Layer = Areas | Lines | Marks
 
@@ -99,16 +106,7 @@ def cars(
     edge: str | None = None,
     glass: str = "ink",
 ) -> list[Layer]:
-    """Return the layers of cars from above.
-
-    Args:
-        poses: (n, 3), m, of their centres.
-        color: colour of their bodies.
-        size: length and width, m.
-        px: least length in the picture.
-        edge: colour of a border.
-        glass: colour of their windows.
-    """
+    """Return the layers of cars from above."""
     body = Marks(poses, CAR_BODY, color, size, px, edge)
     return [body, *(Marks(poses, pane, glass, size, px) for pane in (WINDSCREEN, REAR_WINDOW))]
 

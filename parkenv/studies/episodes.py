@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.compiled.arrays import BoolArray
+from parkenv.engine.search_record import Moment, SearchRecord
 from parkenv.engine.state import SearchState
 from parkenv.mapping.trips import Trip
-from parkenv.show.search_record import Moment, SearchRecord
 from parkenv.studies.results import DECISIONS, Row, timed_row
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
 from parkenv.world.cost_terms import METRICS
@@ -25,24 +25,19 @@ from planners.routes import DriveRoutes
 
 
 class SearchRecorder(Observer):
-    """Records a search, whose true occupancy no agent sees.
+    """Records a search, whose true occupancy no agent sees: the first plan, and each step if wanted."""
 
-    Args:
-        agent: the agent, whose plans are recorded if it has `plan_preview`.
-        keep: called with the arrival and each step; None to record the first plan alone.
-
-    Attributes:
-        policy: plan of the first decision, (n_vertices,) int64; None for agents without a policy.
-    """
-
-    def __init__(self, agent: Agent, keep: Callable[[Moment], None] | None) -> None:
-        self._preview_of, self._keep = getattr(agent, "plan_preview", None), keep
+    def __init__(self, agent: Agent, *, steps: bool) -> None:
+        self._preview_of, self._steps = getattr(agent, "plan_preview", None), steps
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         """Record the arrival."""
         del observation
         self._env: Any = env.unwrapped
-        self.policy: NDArray[np.int64] | None = None
+        self.policy: NDArray[np.int64] | None = (
+            None  # of the first decision; None for agents without a policy
+        )
+        self.moments: list[Moment] = []
         self._decided = False
         self._record()
 
@@ -51,21 +46,16 @@ class SearchRecorder(Observer):
         if not self._decided:
             self.policy = getattr(step.memory, "policy", None)
         self._decided = True
-        self._record(step)
-
-    def _record(self, step: Step | None = None) -> None:
-        if self._keep is None:
-            return
-        state, perception = self._env.state, getattr(self._env, "perception", None)
-        moment = Moment(state.time, state.vertex, state.belief)
-        if perception is not None:
-            moment = moment._replace(captures=perception.results)
-        if step is not None:
+        if self._steps:
             action = int(step.action)
             preview = self._preview_of and self._preview_of(step.observation, action, step.memory)
-            plan = tuple(preview.path) if preview else ()
-            moment = moment._replace(action=action, plan=plan, info=step.info)
-        self._keep(moment)
+            self._record(action=action, plan=tuple(preview.path) if preview else (), info=step.info)
+
+    def _record(self, **decision: Any) -> None:
+        if self._steps:
+            state, perception = self._env.state, getattr(self._env, "perception", None)
+            captures = () if perception is None else perception.results
+            self.moments.append(Moment(state.time, state.vertex, state.belief, captures=captures, **decision))
 
 
 class TripRecorder(Observer):
@@ -133,8 +123,7 @@ class EpisodeRunner:
             observers: further observers.
             moments: whether the record holds each step.
         """
-        recorded: list[Moment] = []
-        recorder = SearchRecorder(self.agent, recorded.append if moments else None)
+        recorder = SearchRecorder(self.agent, steps=moments)
         result = simulate(self.env, self.agent, seed, (recorder, *observers))
         metrics = {
             name: value for name, value in result.info.items() if name not in ("reward_terms", "scenario")
@@ -154,7 +143,7 @@ class EpisodeRunner:
             truncated=result.truncated,
             bound_s=self._bound_s(),
             decision_s=result.decision_s,
-            moments=recorded,
+            moments=recorder.moments,
         )
 
     def row(self, seed: int) -> Row:

@@ -22,7 +22,7 @@ from parkenv.studies.workers import SERIAL
 from parkenv.world.cost_terms import COST_FIELDS
 
 if TYPE_CHECKING:
-    from parkenv.show.search_record import SearchRecord
+    from parkenv.engine.search_record import SearchRecord
     from parkenv.studies.study import Cell, Study
 
 Row = dict[str, Any]

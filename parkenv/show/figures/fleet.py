@@ -1,27 +1,26 @@
-"""Figure of an experiment with many cars: search time, price of anarchy, members and others."""
+"""Charts of many cars: time, price of anarchy, members; zones by hour; days that were counted; curves."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.show.figures.charts import COLORS, GREY, Line, Mark, Panel, Row, draw_panels, key_line, level
 from parkenv.show.figures.lot import draw_zones, zone_colors
-from parkenv.show.figures.picture_files import INK, picture
+from parkenv.show.figures.picture_files import INK, picture, save_picture
 from parkenv.world.lot import ParkingLot
-
-Row = dict[str, Any]
 
 KNOWLEDGE_COLORS = {"own": INK, "shared": "#cc79a7", "reserve": "#0072b2", "full": "#009e73"}
 _STYLES: tuple[tuple[Any, str], ...] = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
-_GREY, _SIMULATED = "#999999", "#cc79a7"
-_CLOSED_FORM = "slots looked at in random order"
+_SIMULATED = "#cc79a7"
 
 
 def save_fleet_figure(
@@ -45,145 +44,146 @@ def save_fleet_figure(
         hours: of `summarize_hours`.
     """
     whole = [row for row in rows if row["share"] in (0.0, max(row["share"] for row in rows))]
-    mixed = [row for row in rows if 0.0 < row["share"] < 1.0]
+    mixed = any(0.0 < row["share"] < 1.0 for row in rows)
     priced = [row for row in whole if np.isfinite(np.float64(row["price_of_anarchy"]))]
-    panels: dict[str, Callable[[Axes], None]] = {}
+    panels: dict[str, Panel] = {}
     if len(whole) > 1 or not hours:  # a single point says little
-        panels["search time"] = lambda ax: _draw_search(ax, whole, closed_form)
+        panels["search time"] = _search(whole, closed_form)
     if priced:
-        panels["price of anarchy"] = lambda ax: _draw_price(ax, priced)
+        panels["price of anarchy"] = _price(priced)
     if mixed and any(row["knows"] == "own" for row in rows):
-        panels["members and others"] = lambda ax: _draw_shares(ax, rows)
+        panels["members and others"] = _shares(rows)
     if hours:
-        panels["occupancy by hour"] = lambda ax: _draw_hours(ax, hours)
-    agents = list(dict.fromkeys(row["agents"] for row in rows))
-    known = list(dict.fromkeys(row["knows"] for row in rows))
-    with picture(path, (0.6 + 4.0 * len(panels), 3.9), f"{title}: {', '.join(panels)}.") as figure:
-        for ax, draw in zip(np.ravel(figure.subplots(1, len(panels))), panels.values(), strict=True):
-            draw(ax)
-            ax.grid(visible=True)
-        handles = [Line2D([], [], color=KNOWLEDGE_COLORS[name], label=f"knows: {name}") for name in known]
-        handles += [
-            Line2D([], [], color="#666666", linestyle=line, marker=marker, markersize=4, label=agent)
-            for agent, (line, marker) in zip(agents, _cycled(agents), strict=True)
-        ]
-        if "search time" in panels:
-            handles.append(Line2D([], [], color=_GREY, linewidth=1.0, label=_CLOSED_FORM))
-        if list(panels) != ["occupancy by hour"]:  # which has a legend of its own
-            figure.legend(
-                handles=handles, loc="outside lower center", ncols=min(len(handles), 2 * len(panels))
-            )
-        figure.suptitle(title, x=0.01, ha="left")
+        panels["occupancy by hour"] = _by_hour(hours)
+    key = [
+        key_line(f"knows: {name}", KNOWLEDGE_COLORS[name])
+        for name in dict.fromkeys(row["knows"] for row in rows)
+    ]
+    key += [key_line(agent, "#666666", **style) for agent, style in _styles(rows).items()]
+    if "search time" in panels:
+        key.append(key_line("slots looked at in random order", GREY, linewidth=1.0))
+    if list(panels) == ["occupancy by hour"]:  # which has a legend of its own
+        key = []
+    keys = {"ncols": min(len(key), 2 * len(panels))}
+    figure = draw_panels(
+        list(panels.values()), (0.6 + 4.0 * len(panels), 3.9), 0, title, key=key, key_style=keys
+    )
+    save_picture(figure, path, f"{title}: {', '.join(panels)}.")
 
 
-def _cycled(agents: Sequence[str]) -> list[tuple[Any, str]]:
-    return [_STYLES[i % len(_STYLES)] for i in range(len(agents))]
+def _styles(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Return the line of each agent."""
+    return {
+        agent: {"linestyle": line, "marker": marker, "markersize": 4}
+        for agent, (line, marker) in zip(
+            dict.fromkeys(row["agents"] for row in rows), cycle(_STYLES), strict=False
+        )
+    }
 
 
-def _curves(rows: Sequence[Row]) -> Iterator[tuple[list[Row], dict[str, Any]]]:
-    """Yield the rows of each agent and knowledge in order of demand, and their style."""
-    agents = list(dict.fromkeys(row["agents"] for row in rows))
-    for agent, (line, marker) in zip(agents, _cycled(agents), strict=True):
+def _curves(rows: Sequence[Row], x: Callable[[Row], Any], y: str) -> Iterator[Line]:
+    """Yield the line of each agent and knowledge, in order of demand."""
+    for agent, style in _styles(rows).items():
         for name, color in KNOWLEDGE_COLORS.items():
-            its = [row for row in rows if (row["agents"], row["knows"]) == (agent, name)]
-            if its:
+            if its := [row for row in rows if (row["agents"], row["knows"]) == (agent, name)]:
                 its.sort(key=_cars_a_day)
-                yield (
-                    its,
-                    {"color": color, "linestyle": line, "marker": marker, "markersize": 4, "capsize": 2},
-                )
+                yield _with_errors(its, x, y, color, style)
+
+
+def _with_errors(rows: Sequence[Row], x: Callable[[Row], Any], y: str, color: str, style: Any) -> Line:
+    """Return a line with the 95 % intervals of its means."""
+    mean = np.array([row[y] for row in rows])
+    ends = np.array([row[f"{y}_ci95"] for row in rows], float).reshape(-1, 2).T
+    more = {"linewidth": 1.2, "capsize": 2, "markersize": 4}
+    return Line(
+        [x(row) for row in rows], mean, color, more | style, interval=np.nan_to_num(np.abs(ends - mean))
+    )
 
 
 def _cars_a_day(row: Row) -> float:
     return float(row["cars"] / row["days"])
 
 
-def _errors(rows: Sequence[Row], name: str) -> np.ndarray:
-    """Return the distances of the ends of the 95 % intervals from the means, (2, n)."""
-    mean = np.array([row[name] for row in rows])
-    ends = np.array([row[f"{name}_ci95"] for row in rows], float).reshape(-1, 2).T
-    return np.asarray(np.nan_to_num(np.abs(ends - mean)))
+def _search(rows: Sequence[Row], closed_form: Callable[[FloatArray], FloatArray]) -> Panel:
+    occupancy = np.linspace(min(row["occupancy"] for row in rows), 1.0, 200)
+    lines = [
+        *_curves(rows, lambda row: 100.0 * row["occupancy"], "search_s"),
+        Line(100.0 * occupancy, closed_form(occupancy), GREY, {"linewidth": 1.0}),
+    ]
+    top = 1.25 * max(row["search_s"] for row in rows)
+    return Panel(lines, "Search time", {"xlabel": "mean occupancy, %", "ylabel": "s", "ylim": (0.0, top)})
 
 
-def _draw_search(ax: Axes, rows: Sequence[Row], closed_form: Callable[[FloatArray], FloatArray]) -> None:
-    for its, style in _curves(rows):
-        x = [100.0 * row["occupancy"] for row in its]
-        ax.errorbar(x, [row["search_s"] for row in its], _errors(its, "search_s"), linewidth=1.2, **style)
-    low = min(row["occupancy"] for row in rows)
-    occupancy = np.linspace(low, 1.0, 200)
-    ax.plot(100.0 * occupancy, closed_form(occupancy), color=_GREY, linewidth=1.0)
-    most = max(row["search_s"] for row in rows)
-    ax.set(xlabel="mean occupancy, %", ylabel="s", ylim=(0.0, 1.25 * most), title="Search time")
+def _price(rows: Sequence[Row]) -> Panel:
+    rates = {row["arrivals_per_hour"] for row in rows}
+    named = any(isinstance(rate, str) for rate in rates)
+    axes: dict[str, Any] = {"xlabel": "arrivals per hour"} | ({} if named else {"xticks": sorted(rates)})
+    lines = _curves(
+        rows,
+        lambda row: _demand(row["arrivals_per_hour"]) if named else row["arrivals_per_hour"],
+        "price_of_anarchy",
+    )
+    return Panel(list(lines), "Total time over that of reservations for all", axes)
 
 
-def _draw_price(ax: Axes, rows: Sequence[Row]) -> None:
-    named = any(isinstance(row["arrivals_per_hour"], str) for row in rows)
-    for its, style in _curves(rows):
-        ax.errorbar(
-            [_demand(rate) if named else rate for rate in (row["arrivals_per_hour"] for row in its)],
-            [row["price_of_anarchy"] for row in its],
-            _errors(its, "price_of_anarchy"),
-            linewidth=1.2,
-            **style,
-        )
-    ax.set(xlabel="arrivals per hour", title="Total time over that of reservations for all")
-    if not named:
-        ax.set_xticks(sorted({row["arrivals_per_hour"] for row in rows}))
-
-
-def _draw_shares(ax: Axes, rows: Sequence[Row]) -> None:
-    """Draw how much members (filled) and others (hollow) gain or lose, at the demand with the highest price of anarchy.
+def _shares(rows: Sequence[Row]) -> Panel:
+    """Return how much members (filled) and others (hollow) gain or lose, at the demand with the highest price.
 
     Of the first agent; without prices, at the greatest demand.
     """
-    agent = rows[0]["agents"]
-    its = [row for row in rows if row["agents"] == agent and row["knows"] != "own"]
-    own = [row for row in rows if row["agents"] == agent and row["knows"] == "own"]
+    its = [row for row in rows if row["agents"] == rows[0]["agents"]]
+    own = [row for row in its if row["knows"] == "own"]
     priced = max(own, key=lambda row: (np.nan_to_num(row["price_of_anarchy"]), _cars_a_day(row)))
     chosen = priced["arrivals_per_hour"]
-    ax.axhline(0.0, color=KNOWLEDGE_COLORS["own"], linewidth=1.0, linestyle=":")
+    marks: list[Any] = [level(0.0, KNOWLEDGE_COLORS["own"], linewidth=1.0, linestyle=":")]
     for name, color in KNOWLEDGE_COLORS.items():
-        known = sorted(
-            (row for row in its if (row["knows"], row["arrivals_per_hour"]) == (name, chosen)),
-            key=lambda row: row["share"],
-        )
-        for group, face in (("members_difference_s", color), ("others_difference_s", "white")):
-            there = [row for row in known if np.isfinite(np.float64(row[group]))]
+        for group, face, line in (
+            ("members_difference_s", color, "-"),
+            ("others_difference_s", "white", "--"),
+        ):
+            there = sorted(
+                (
+                    row
+                    for row in its
+                    if name != "own"
+                    and (row["knows"], row["arrivals_per_hour"]) == (name, chosen)
+                    and np.isfinite(np.float64(row[group]))
+                ),
+                key=lambda row: row["share"],
+            )
             if there:
-                x, y = [100.0 * row["share"] for row in there], [row[group] for row in there]
-                ax.errorbar(
-                    x, y, _errors(there, group), color=color, marker="o", markersize=4, capsize=2,
-                    markerfacecolor=face, linestyle="-" if group[0] == "m" else "--", linewidth=1.2,
-                )  # fmt: skip
-    ax.set(
-        xlabel="share of members, %",
-        ylabel="s",
-        title=f"Change for members (filled) and others, {_demand(chosen)}",
-    )
+                style = {"marker": "o", "markerfacecolor": face, "linestyle": line}
+                marks.append(_with_errors(there, lambda row: 100.0 * row["share"], group, color, style))
+    title = f"Change for members (filled) and others, {_demand(chosen)}"
+    return Panel(marks, title, {"xlabel": "share of members, %", "ylabel": "s"})
 
 
 def _demand(rate: float | str) -> str:
     return rate if isinstance(rate, str) else f"{rate:g}/h"
 
 
-def _draw_hours(ax: Axes, rows: Sequence[Row]) -> None:
-    """Draw occupancy by hour, simulated at each demand and as counted (dashed), of one agent, with one knowledge."""
+def _by_hour(rows: Sequence[Row]) -> Panel:
+    """Return occupancy by hour, simulated at each demand and as counted (dashed), of one agent, with one knowledge."""
     its = [row for row in rows if all(row[name] == rows[0][name] for name in ("agents", "knows", "share"))]
-    columns = ("hour", "occupancy", "counted_occupancy")
-    for number, demand in enumerate(dict.fromkeys(row["arrivals_per_hour"] for row in its)):
-        there = [[row[name] for name in columns] for row in its if row["arrivals_per_hour"] == demand]
-        hour, simulated, counted = np.array(there).T
-        if number == 0:
-            ax.plot(hour + 0.5, 100.0 * counted, "--", color=INK, label="as counted")
-        line, marker = _STYLES[number % len(_STYLES)]
-        style = {"color": _SIMULATED, "linestyle": line, "marker": marker, "markersize": 4}
-        ax.plot(hour + 0.5, 100.0 * simulated, label=f"simulated, arrivals {_demand(demand)}", **style)
-    ax.set(ylabel="%", ylim=(0.0, 100.0), title="Occupancy")
-    _mark_hours(ax, [row["hour"] for row in its])
-    ax.legend()
+    lines: list[Any] = []
+    for demand, (line, marker) in zip(
+        dict.fromkeys(row["arrivals_per_hour"] for row in its), cycle(_STYLES), strict=False
+    ):
+        there = [row for row in its if row["arrivals_per_hour"] == demand]
+        hour, simulated, counted = (
+            np.array([row[name] for row in there]) for name in ("hour", "occupancy", "counted_occupancy")
+        )
+        if not lines:
+            style = {"linestyle": "--", "label": "as counted"}
+            lines.append(Line(hour + 0.5, 100.0 * counted, INK, style))
+        label = f"simulated, arrivals {_demand(demand)}"
+        points = {"linestyle": line, "marker": marker, "markersize": 4, "label": label}
+        lines.append(Line(hour + 0.5, 100.0 * simulated, _SIMULATED, points))
+    hours = partial(_mark_hours, [row["hour"] for row in its])
+    return Panel([*lines, hours], "Occupancy", {"ylabel": "%", "ylim": (0.0, 100.0)}, legend={})
 
 
-def _mark_hours(ax: Axes, hours: Sequence[int]) -> None:
+def _mark_hours(hours: Sequence[int], ax: Axes) -> None:
     """Mark full hours on the horizontal axis, from the first of the hours to the end of the last one."""
     ax.set_xlim(min(hours), max(hours) + 1)
     ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
@@ -193,28 +193,166 @@ def _mark_hours(ax: Axes, hours: Sequence[int]) -> None:
 def save_zones_figure(
     lot: ParkingLot, title: str, hours: Sequence[int], courses: Mapping[str, FloatArray], path: str | Path
 ) -> None:
-    """Draw the zones of a lot: where they are, how full they are by hour, and what is paid in them.
-
-    Args:
-        lot: the lot.
-        title: title of the figure.
-        hours: of the day.
-        courses: `occupancy` and `paid` by zone and hour, (n_zones, n_hours) each.
-        path: file to write.
-    """
+    """Draw the zones of a lot: where they are, how full they are by hour, and what is paid in them."""
     at = [hour + 0.5 for hour in hours]
+
+    def panel(values: FloatArray, title: str, **axes: Any) -> Panel:
+        style = {"marker": "o", "markersize": 4}
+        lines = [
+            Line(at, course, color, style) for course, color in zip(values, zone_colors(lot), strict=True)
+        ]
+        return Panel([*lines, partial(_mark_hours, hours)], title, axes)
+
     with picture(path, (5.8, 6.2), f"{title}: map, slots taken and revenue by hour.") as figure:
         axes = figure.subplot_mosaic([["map", "map"], ["occupancy", "paid"]], height_ratios=(1.3, 1.0))
-        zones = draw_zones(lot, axes["map"])
-        axes["map"].legend(
-            handles=zones, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=4, frameon=False
-        )
-        for number, color in enumerate(zone_colors(lot)):
-            for name, scale in (("occupancy", 100.0), ("paid", 1.0)):
-                axes[name].plot(at, scale * courses[name][number], color=color, marker="o", markersize=4)
-        axes["occupancy"].set(ylabel="%", ylim=(0.0, 100.0), title="Slots taken")
-        axes["paid"].set(title="Paid an hour, when cars park", ylim=(0.0, None))
-        for name in ("occupancy", "paid"):
-            _mark_hours(axes[name], hours)
-            axes[name].grid(visible=True)
+        key: dict[str, Any] = {
+            "loc": "upper center",
+            "bbox_to_anchor": (0.5, 0.0),
+            "ncols": 4,
+            "frameon": False,
+        }
+        axes["map"].legend(handles=draw_zones(lot, axes["map"]), **key)
+        full = panel(100.0 * courses["occupancy"], "Slots taken", ylabel="%", ylim=(0.0, 100.0))
+        full.draw(axes["occupancy"])
+        panel(courses["paid"], "Paid an hour, when cars park", ylim=(0.0, None)).draw(axes["paid"])
         figure.suptitle(title, x=0.01, ha="left")
+
+
+class CarParkDays(NamedTuple):
+    """A car park over the hours of a day."""
+
+    name: str
+    capacity: float
+    simulated: FloatArray  # (n_hours,) cars, mean of the days of the fleet
+    followed: FloatArray  # (n_hours,) cars counted, mean of the days that the demand follows
+    held_out: FloatArray  # (d, n_hours) cars counted on later days; NaN: not counted
+
+
+def save_counted_demand(car_parks: Sequence[CarParkDays], hours: FloatArray, path: Path) -> None:
+    """Draw the share of the places that is taken: simulated, as counted on the days followed, and on later ones."""
+    columns = min(len(car_parks), 4)
+    size = 2.8 * columns + 0.6, 2.1 * -(-len(car_parks) // columns) + 0.6
+    panels = []
+    for park in car_parks:
+        seen = park.held_out[np.isfinite(park.held_out).any(axis=1)]
+        thin = {"linewidth": 0.5, "alpha": 0.5}
+        lines = [
+            *(Line(hours, day / park.capacity, GREY, thin) for day in seen),
+            Line(hours, park.followed / park.capacity, "#0072b2", {"linestyle": "--"}),
+            Line(hours, park.simulated / park.capacity, "#d55e00"),
+        ]
+        axes = {"xlim": (hours[0] - 1, hours[-1]), "ylim": (0, 1.02)}
+        name = f"{park.name}, {park.capacity:.0f}"
+        panels.append(Panel(lines, name, axes, title_style={"fontsize": 8}))
+    key = [
+        key_line("counted later, each day", GREY, linewidth=0.5, alpha=0.5),
+        key_line("counted, days followed", "#0072b2", linestyle="--"),
+        key_line("simulated", "#d55e00"),
+    ]
+    style = {"loc": "outside upper left", "ncols": 3, "fontsize": 8}
+    figure = draw_panels(panels, size, columns, share="xy", key=key, key_style=style)
+    figure.supxlabel("hour of the day", fontsize=9)
+    figure.supylabel("share of the places taken", fontsize=9)
+    save_picture(figure, path)
+
+
+Curve = Mapping[str, Sequence[float]]
+_CURVE_COLORS = (*COLORS, "#666666")
+_POINTS = "#9a9a9a"
+
+
+def save_curves(
+    curves: Mapping[str, Curve],
+    points: Sequence[Row],
+    errors: Row,
+    forms: Mapping[str, Callable[[FloatArray], FloatArray]],
+    title: str,
+    path: str | Path,
+) -> None:
+    """Draw the curves of a lot.
+
+    Panels: search time against occupancy with its 95 % band, zone-hours and usual forms; held-out zone-hours, predicted
+    against measured; relative errors of the curve and the usual forms; walk; and the share that finds no space, if any.
+
+    Args:
+        curves: columns of the curve of each purpose, all of them first; see `Curves`.
+        points: of `held_out.csv`.
+        errors: of the search time of held-out zones: of `curve` and other predictors, and `chance`.
+        forms: usual forms, fitted to the points.
+        title: title of the figure.
+        path: the PNG to write.
+    """
+    whole = next(iter(curves.values()))
+    occupancy, measured, predicted, cars = (
+        np.array([row[name] for row in points]) for name in ("occupancy", "measured", "predicted", "cars")
+    )
+    grid = np.linspace(0.0, 0.98, 99)
+    search: list[Mark] = [
+        Line(grid, form(grid), INK, {"linestyle": line, "linewidth": 1.0, "label": name})
+        for (name, form), line in zip(forms.items(), ("--", ":", "-."), strict=False)
+    ]
+    search.append(_line(whole, "search_s", COLORS[0], "curve of the whole lot"))
+    top = 1.15 * max(whole["search_s_high"])
+    held_out: list[Panel] = []
+    if points:
+        dots: dict[str, Any] = {"s": 24.0 * cars / np.quantile(cars, 0.95), "linewidth": 0}
+        search.insert(
+            0,
+            lambda ax: ax.scatter(
+                occupancy, measured, color=_POINTS, alpha=0.35, label="a zone in an hour, measured", **dots
+            ),
+        )
+        top = max(top, float(np.quantile(measured, 0.99)))
+        end = float(np.quantile(np.concatenate([measured, predicted]), 0.995))
+        marks: list[Mark] = [
+            Line([0, end], [0, end], INK, {"linewidth": 1.0}),
+            lambda ax: ax.scatter(measured, predicted, color=COLORS[0], alpha=0.3, **dots),
+        ]
+        axes: dict[str, Any] = {"xlabel": "measured, s", "ylabel": "by the curve of the other zones, s"}
+        axes |= {"xlim": (0, end), "ylim": (0, end)}
+        held_out = [Panel(marks, "Search time of zones that were held out", axes), _errors(errors)]
+    panels = [_panel(search, "Search time", top, "search beyond the direct drive, s"), *held_out]
+    by_purpose = {"walk_s": "walk, s", "balked_fraction": "share that finds no space"}
+    if max(max(curve["balked_fraction"]) for curve in curves.values()) <= 0.001:
+        del by_purpose["balked_fraction"]
+    for name, label in by_purpose.items():
+        lines = [
+            _line(curve, name, color, purpose)
+            for (purpose, curve), color in zip(curves.items(), _CURVE_COLORS, strict=False)
+        ]
+        top = 1.35 * max(max(curve[f"{name}_high"]) for curve in curves.values())
+        percent = "xy" if name == "balked_fraction" else "x"
+        panel = _panel(lines, label.partition(",")[0].capitalize(), top, label)
+        panels.append(panel._replace(percent=percent))
+    columns = min(len(panels), 3)
+    size = 0.6 + 3.6 * columns, 3.3 * -(-len(panels) // columns)
+    figure = draw_panels(panels, size, columns, title)
+    save_picture(figure, path, f"{title}: curves with 95 % bands, and zones that were held out.")
+
+
+def _panel(marks: Sequence[Mark], title: str, top: float, label: str) -> Panel:
+    axes = {"xlim": (0, 1), "ylim": (0, top), "xlabel": "spaces around that are taken", "ylabel": label}
+    lines = sum(isinstance(mark, Line) for mark in marks)
+    return Panel(
+        marks, title, axes, "both", {"loc": "upper left", "fontsize": 7.5, "ncols": 1 + (lines > 4)}, "x"
+    )
+
+
+def _line(curve: Curve, name: str, color: str, label: str) -> Line:
+    width = 2.2 if color == COLORS[0] else 1.2
+    style: dict[str, Any] = {"marker": "o", "linewidth": width, "markersize": 3, "label": label}
+    band = curve[f"{name}_low"], curve[f"{name}_high"]
+    return Line(curve["occupancy"], curve[name], color, style, band)
+
+
+def _errors(errors: Row) -> Panel:
+    chance, off = errors["chance"], {name: value for name, value in errors.items() if name != "chance"}
+    axes = {"xlim": (0, 1.15 * max(off.values())), "ylim": (len(off) - 0.2, -0.6)}
+    return Panel([partial(_draw_errors, off, chance)], "Off by, zones held out", axes, "x", None, "x")
+
+
+def _draw_errors(off: Mapping[str, float], chance: float, ax: Axes) -> None:
+    bars = ax.barh(list(off), list(off.values()), color=[COLORS[0], *[_POINTS] * (len(off) - 1)], height=0.6)
+    ax.bar_label(bars, [f"{value:.0%}" for value in off.values()], padding=3)
+    ax.axvline(chance, color=INK, linewidth=1.0, linestyle="--")
+    ax.text(chance, len(off) - 0.45, "  chance in the days", fontsize=7.5, va="center")

@@ -126,14 +126,7 @@ def drive_graph(lot: ParkingLot) -> list[Layer]:
 
 
 def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) -> None:
-    """Draw two discs at each slot, as in T Fig. 4.7: an outer one for the prediction, an inner one for the truth.
-
-    Args:
-        lot: a lot that is already drawn in `ax`.
-        ax: axes to draw in.
-        outer: (n_slots,) probabilities that the slot is taken, coloured by `BELIEF_MAP`.
-        inner: (n_slots, 3 or 4) RGB(A) in 0..1.
-    """
+    """Draw two discs at each slot, as in T Fig. 4.7: an outer one for the prediction, an inner one for the truth."""
     scale = points_per_m(ax)
     # As wide as the slot, or larger if that is too small to see and the distance to neighbours allows it.
     nearest = np.asarray(cKDTree(lot.slot_xy).query(lot.slot_xy, k=2)[0])[:, 1]

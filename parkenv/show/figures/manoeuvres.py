@@ -9,15 +9,16 @@ from typing import Any
 import cv2
 import numpy as np
 import shapely
+from PIL import Image as PillowImage
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.scene import Scene
 from parkenv.driving.vehicle import STATE_SIZE, placed
-from parkenv.show.colors import FREE, PALETTE, mixed_color
-from parkenv.show.figures.parkings import save_sheet
+from parkenv.files.atomic_write import atomic_write
+from parkenv.show.colors import FREE, mixed_color
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.frames.drive import LARGEST_SCALE, steered_car, trail
-from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, strip, write_line
+from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, painted_finely, strip, write_line
 from parkenv.show.painters.opencv import MapView, paint
 from parkenv.show.scene import Areas, Layer, Lines
 
@@ -26,10 +27,21 @@ FPS, SPEED_UP, COLORS = 10, 4, 64
 _SIZE = (WIDTH, HEIGHT - HUD)
 _MARGIN = 2.5  # m, around what is driven
 _LINE = 0.16  # m, obstacles that are lines
+GAP = 6  # between pictures of a sheet, px
 _STILL = 5  # times that a film shows its last frame
 
 Shown = tuple[Scene, Mapping[str, Any], str]
 """A scene, its lines of `trajectories.csv`, and what is said of it."""
+
+
+def save_sheet(pictures: Sequence[Image], path: Path) -> None:
+    """Write frames, (480, 640, 3) each, as one PNG, two a row."""
+    sheet = np.full((-(-len(pictures) // 2), 2, HEIGHT + GAP, WIDTH + GAP, 3), 255, dtype=np.uint8)
+    for i, frame in enumerate(pictures):
+        sheet[i // 2, i % 2, :HEIGHT, :WIDTH] = frame
+    whole = sheet.swapaxes(1, 2).reshape(-1, 2 * (WIDTH + GAP), 3)[:-GAP, :-GAP]
+    with atomic_write(path) as beside:
+        PillowImage.fromarray(whole).save(beside, format="PNG")
 
 
 def save_manoeuvres(shown: Sequence[Shown], path: Path) -> None:
@@ -43,14 +55,7 @@ def save_manoeuvres(shown: Sequence[Shown], path: Path) -> None:
 def save_manoeuvre_film(
     scene: Scene, driven: Mapping[str, Any], others: Mapping[str, Any], path: Path
 ) -> None:
-    """Write a film of a manoeuvre as GIF, `SPEED_UP` times as fast as it was.
-
-    Args:
-        scene: the scene.
-        driven: its lines of `trajectories.csv`.
-        others: its lines of `road_users.csv`; empty without any.
-        path: the file to write.
-    """
+    """Write a film of a manoeuvre as GIF, `SPEED_UP` times as fast as it was."""
     states, time = _states(scene, driven), np.array(driven["time_s"])
     ends = np.searchsorted(time, np.arange(0.0, time[-1] + SPEED_UP / FPS, SPEED_UP / FPS)).clip(1, len(time))
     users = np.zeros((len(time), 0, 3))
@@ -84,8 +89,7 @@ def _frame(
     view = MapView.fit(
         np.array([corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN]), _SIZE, LARGEST_SCALE
     )
-    fine = np.full((_SIZE[1] * 2, _SIZE[0] * 2, 3), PALETTE["floor"], dtype=np.uint8)
-    paint(fine, MapView(view.turn, 2 * view.scale, 2 * view.shift, 2), _ground(scene))
+    fine = painted_finely(view, _SIZE, _ground(scene), "floor", 2)
     image = cv2.resize(fine, _SIZE, interpolation=cv2.INTER_AREA)
     others = [placed(user.outline, pose) for user, pose in zip(scene.crossings, users, strict=False)]
     car = [*trail(scene.vehicle, states[:, :3]), *steered_car(scene.vehicle, states[-1])]

@@ -43,17 +43,6 @@ STYLE: dict[Any, Any] = {
 INK = "#181b1f"
 
 
-def legend_columns(labels: Sequence[str], width: float, most: int) -> int:
-    """Return how many columns, at most `most`, a legend of these labels may have in a width, inches."""
-    length = np.array([0.5 + 0.065 * len(label) for label in labels])
-    fits = (
-        n
-        for n in range(most, 1, -1)
-        if sum(part.max(initial=0.0) for part in np.array_split(length, n)) <= width
-    )
-    return next(fits, 1)
-
-
 @contextmanager
 def picture(
     path: str | Path, size: tuple[float, float], caption: str = "", layout: Any = "constrained"

@@ -11,22 +11,23 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
-from matplotlib.lines import Line2D
 from matplotlib.path import Path as MplPath
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
+from numpy.typing import NDArray
 
+from parkenv.engine.search_record import SearchRecord
 from parkenv.errors import InputError
 from parkenv.show.colors import hex_color
+from parkenv.show.figures.charts import key_line
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE
 from parkenv.show.painters.axes import paint, points_per_m
 from parkenv.show.plurals import plural
 from parkenv.show.scene import ARROWHEAD, LANE_ARROW, Layer, Lines, Marks, posed, poses_on
-from parkenv.show.search_record import SearchRecord
 from parkenv.world.cost_terms import COST_TERMS
-from parkenv.world.lot import PARK
+from parkenv.world.lot import PARK, ParkingLot
 from parkenv.world.scenario import KMH
 
 PATH, WALK = hex_color("car"), hex_color("goal")
@@ -40,17 +41,13 @@ def draw_search(record: SearchRecord, ax: Axes) -> None:
     At each slot, an inner disc shows the true occupancy and an outer ring the forecast. The path (from 1 to 2) and the
     walk follow and, if there is room, the first plan's action at each vertex (T Fig. 4.8). Set the final size of the
     axes first: line widths and arrows depend on the scale.
-
-    Args:
-        record: the search.
-        ax: axes to draw in; sets their limits, aspect and title.
     """
     lot = record.scenario.lot
     draw_lot(lot, ax)
     scale = points_per_m(ax)
     draw_discs(lot, ax, record.forecast, BELIEF_MAP(record.occupied.astype(np.float64)))
-    if _shows_policy(record, scale):
-        _draw_policy(record, ax, scale)
+    if record.policy is not None and scale >= POLICY_SCALE:
+        _draw_policy(lot, record.policy, record.path, ax, scale)
     _draw_path(record, ax, scale)
     title = _title(record, ax.get_window_extent().width / ax.figure.dpi)
     ax.set_title(title, loc="left", fontsize=mpl.rcParams["font.size"], linespacing=1.35)
@@ -92,46 +89,36 @@ def _draw_path(record: SearchRecord, ax: Axes, scale: float) -> None:
         marks = poses_on(xy, (np.arange(n) + 0.5) / n * length.sum())
         layers.append(Marks(marks, ARROWHEAD, PATH, px=1.7 * (3.0 + 1.4 * width), edge=INK, edge_px=0.8))
     paint(ax, layers, 3.0)
+    words: dict[str, Any] = {
+        "weight": "bold",
+        "fontsize": 8,
+        "ha": "center",
+        "va": "center_baseline",
+        "zorder": 6.1,
+    }
     for number, point, color in (("1", xy[0], INK), ("2", xy[-1], WALK if parked else "#c03219")):
         ax.plot(*point, marker="o", markersize=11, color=color, markeredgecolor="white", zorder=6)
-        ax.annotate(
-            number,
-            point,
-            color="white",
-            weight="bold",
-            fontsize=8,
-            ha="center",
-            va="center_baseline",
-            zorder=6.1,
-        )
+        ax.annotate(number, point, color="white", **words)
 
 
-def _shows_policy(record: SearchRecord, scale: float) -> bool:
-    return record.policy is not None and scale >= POLICY_SCALE
-
-
-def _draw_policy(record: SearchRecord, ax: Axes, scale: float) -> None:
-    lot, policy = record.scenario.lot, record.policy
-    assert policy is not None
+def _draw_policy(lot: ParkingLot, policy: NDArray[np.int64], path: list[int], ax: Axes, scale: float) -> None:
     drives = np.flatnonzero(policy < PARK)
     target = lot.neighbors[drives, policy[drives]]
     drives, target = drives[target >= 0], target[target >= 0]
     ahead = lot.vertex_xy[target] - lot.vertex_xy[drives]
     poses = posed(lot.vertex_xy[drives], np.arctan2(ahead[:, 1], ahead[:, 0]))
-    driven = np.isin(drives, record.path)
+    driven = np.isin(drives, path)
     for there, color in ((driven, INK), (~driven, "white")):
         paint(ax, [Marks(poses[there], LANE_ARROW, color, (1.9, 0.8))], 3.5)
     size = min(2.1 * scale, 14.0)
+    style: dict[str, Any] = {
+        "linestyle": "none",
+        "marker": _text_marker("P"),
+        "markersize": size,
+        "zorder": 3.6,
+    }
     for color, extra in ((INK, 1.6), ("white", 0.0)):
-        ax.plot(
-            *lot.vertex_xy[np.flatnonzero(policy == PARK)].T,
-            linestyle="none",
-            marker=_text_marker("P"),
-            markersize=size,
-            color=color,
-            markeredgewidth=extra,
-            zorder=3.6,
-        )
+        ax.plot(*lot.vertex_xy[np.flatnonzero(policy == PARK)].T, color=color, markeredgewidth=extra, **style)
 
 
 def _text_marker(text: str) -> MplPath:
@@ -168,49 +155,37 @@ def draw_searches(records: Sequence[SearchRecord]) -> Figure:
             bottom = total[1] - (line + 1) * (height + title)
             box = left / total[0], bottom / total[1], width / total[0], height / total[1]
             draw_search(record, figure.add_axes(box))
-        policy = any(_shows_policy(t, points_per_m(ax)) for t, ax in zip(records, figure.axes, strict=True))
+        scales = map(points_per_m, figure.axes)
+        policy = any(t.policy is not None and s >= POLICY_SCALE for t, s in zip(records, scales, strict=True))
         _draw_key(figure, key, zoom, policy=policy)
     return figure
 
 
 def _draw_key(figure: Figure, height: float, zoom: float, *, policy: bool) -> None:
     """Draw the legend along the lower edge."""
-    disc: dict[str, Any] = {
-        "linestyle": "none",
-        "marker": "o",
-        "markeredgecolor": INK,
-        "markeredgewidth": 0.5,
-    }
-    disc["markersize"] = 8 * zoom
+    disc: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 8 * zoom}
+    disc |= {"markeredgecolor": INK, "markeredgewidth": 0.5}
     cased = [Stroke(linewidth=3.8, foreground=INK), Normal()]
     handles = [
-        Line2D([], [], color=BELIEF_MAP(0.0), label="true occupancy: free", **disc),
-        Line2D([], [], color=BELIEF_MAP(1.0), label="taken", **disc),
-        Line2D([], [], color=PATH, linewidth=2.2, path_effects=cased, label="driven, 1 to 2"),
-        Line2D([], [], color=WALK, linewidth=1.8, linestyle=(0, (3, 2)), label="walk to the goal"),
+        key_line("true occupancy: free", BELIEF_MAP(0.0), **disc),
+        key_line("taken", BELIEF_MAP(1.0), **disc),
+        key_line("driven, 1 to 2", PATH, linewidth=2.2, path_effects=cased),
+        key_line("walk to the goal", WALK, linewidth=1.8, linestyle=(0, (3, 2))),
     ]
     if policy:
-        plan = _text_marker("P→")
-        handles.append(
-            Line2D([], [], linestyle="none", marker=plan, markersize=16 * zoom, color=INK, label="first plan")
-        )
+        plan: dict[str, Any] = {"linestyle": "none", "marker": _text_marker("P→"), "markersize": 16 * zoom}
+        handles.append(key_line("first plan", INK, **plan))
     width, total = figure.get_size_inches()
     middle = 0.4 * height
-    bar = figure.add_axes(
-        ((width / 2 - 3.5 * zoom) / width, middle / total, 1.3 * zoom / width, 0.11 * zoom / total)
-    )
+    place = (width / 2 - 3.5 * zoom) / width, middle / total, 1.3 * zoom / width, 0.11 * zoom / total
+    bar = figure.add_axes(place)
     bar.imshow(np.linspace(0, 1, 256)[None], aspect="auto", cmap=BELIEF_MAP, extent=(0, 1, 0, 1))
     bar.set_yticks([])
     bar.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
     bar.tick_params(length=2, labelsize=8 * zoom, pad=1)
     bar.set_title("ring: forecast P(taken)", fontsize=8.5 * zoom, pad=3, loc="center")
+    at = (width / 2 - 2.0 * zoom) / width, (middle + 0.05 * zoom) / total
     figure.legend(
-        handles=handles,
-        loc="center left",
-        bbox_to_anchor=((width / 2 - 2.0 * zoom) / width, (middle + 0.05 * zoom) / total),
-        ncols=len(handles),
-        fontsize=8.5 * zoom,
-        handletextpad=0.6,
-        handlelength=1.8,
-        columnspacing=1.1,
-    )
+        handles=handles, loc="center left", bbox_to_anchor=at, ncols=len(handles), fontsize=8.5 * zoom,
+        handletextpad=0.6, handlelength=1.8, columnspacing=1.1,
+    )  # fmt: skip

@@ -1,28 +1,40 @@
-"""Figures of total times: means by part, against occupancy, failure cost and forecast, and distributions."""
+"""Charts of searches: total times by part, setting and share of the searches; days of a commute; training."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.known_names import UNBEATEN
 from parkenv.show.columns import SETTING_AXES
-from parkenv.show.figures.picture_files import INK, STYLE, legend_columns
+from parkenv.show.figures.charts import (
+    BOLD,
+    COLORS,
+    Line,
+    Mark,
+    Panel,
+    Row,
+    draw_panels,
+    key_line,
+    legend_columns,
+    level,
+    spread,
+)
+from parkenv.show.figures.picture_files import INK, picture, save_picture
 from parkenv.show.plurals import LEAST_SEARCHES, plural
 from parkenv.world.cost_terms import COST_TERMS
-
-Row = Mapping[str, Any]
 
 AGENT_COLORS = {
     "mdp": "#0072b2",
@@ -49,6 +61,12 @@ AGENT_COLORS = {
 _OTHERS = ("#5c4a3d", "#a6761d", "#6a3d9a", "#1b7a8c", "#b15928")
 OFF_SCALE = 3.0
 """Totals above this multiple of the median are cut off, so that they do not compress the rest."""
+BOUND = "clairvoyant lower bound"
+_AXIS_END = 2.5
+"""The axis of a distribution ends at this multiple of the median."""
+_TOTAL = "mean total time, s; 95 % interval"
+Totals = Mapping[str, FloatArray]
+"""Total times of each agent, (n_episodes,) s, by name."""
 
 
 def agent_color(agent: str) -> str:
@@ -57,91 +75,64 @@ def agent_color(agent: str) -> str:
 
 
 def draw_time_split(rows: Sequence[Row]) -> Figure:
-    """Draw mean total times: a panel per setting, a bar per agent, split into drive, failed attempts and walk.
-
-    Args:
-        rows: rows of one scenario, as `parkenv compare` writes them to `summary.json`.
-    """
-    _require_rows(rows)
-    panels: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        panels.setdefault(tuple(row[k] for k in SETTING_AXES), []).append(row)
-    most = max(len(panel) for panel in panels.values())
-    columns = 1 if len(panels) == 1 else 2 if len(panels) <= 4 else 3
-    lines = -(-len(panels) // columns)
+    """Draw mean total times: a panel per setting, a bar per agent, split into drive, failed attempts and walk."""
     limit = _limit(rows)
-    with mpl.rc_context(STYLE):
-        figure = Figure(
-            figsize=((6.5, 9.0, 12.0)[columns - 1], 0.95 + lines * (0.62 + 0.26 * most)), layout="constrained"
+    settings: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        settings.setdefault(tuple(row[k] for k in SETTING_AXES), []).append(row)
+    most = max(map(len, settings.values()))
+    columns = 1 if len(settings) == 1 else 2 if len(settings) <= 4 else 3
+    width = (6.5, 9.0, 12.0)[columns - 1]
+    key: list[Any] = [
+        Patch(color=term.color, label=term.label)
+        for term in COST_TERMS
+        if not term.optional or any(row[term.field] for row in rows)
+    ]
+    key.append(key_line(BOUND, INK, linestyle=(0, (3, 2)), linewidth=1.2))
+    keys = legend_columns([handle.get_label() for handle in key], width, 5 if columns > 1 else 3)
+    panels = [
+        Panel(
+            [partial(_draw_split, of_setting, limit)],
+            "failure cost {:g} s, walk {:g}, drive {:g} km/h".format(*setting),
+            {"xlim": (0, limit), "ylim": (len(of_setting) - 0.5, -0.5)},
+            "x",
         )
-        axes = figure.subplots(lines, columns, squeeze=False, sharex=True)
-        for ax, (setting, panel) in zip(axes.flat, panels.items(), strict=False):
-            _draw_split(ax, panel, limit)
-            ax.set_title("failure cost {:g} s, walk {:g}, drive {:g} km/h".format(*setting))
-        for ax in axes.flat[len(panels) :]:
-            ax.remove()
-        for column in range(columns):
-            lowest = (len(panels) - 1 - column) // columns
-            axes[lowest, column].tick_params(labelbottom=True)
-            axes[lowest, column].set_xlabel("mean total time, s; 95 % interval", color="#444444")
-        handles: list[Any] = [
-            Patch(color=term.color, label=term.label)
-            for term in COST_TERMS
-            if not term.optional or any(row[term.field] for row in rows)
-        ]
-        handles.append(
-            Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant lower bound")
-        )
-        labels, most = [handle.get_label() for handle in handles], 5 if columns > 1 else 3
-        keys = legend_columns(labels, figure.get_figwidth(), most)
-        figure.legend(handles=handles, loc="outside lower center", ncols=keys)
-        _name(figure, rows)
+        for setting, of_setting in settings.items()
+    ]
+    size = width, 0.95 + -(-len(panels) // columns) * (0.62 + 0.26 * most)
+    style: dict[str, Any] = {"key": key, "key_style": {"ncols": keys}, "label": {"x": _TOTAL}, "share": "x"}
+    figure = draw_panels(panels, size, columns, _name(rows), bold=True, **style)
+    for ax in figure.axes:
+        ax.xaxis.label.set_color("#444444")
     return figure
 
 
-def _draw_split(ax: Axes, rows: Sequence[Row], limit: float) -> None:
-    y = np.arange(len(rows))
+def _draw_split(rows: Sequence[Row], limit: float, ax: Axes) -> None:
+    y, left = np.arange(len(rows)), np.zeros(len(rows))
     total = np.array([row["total_s"] for row in rows])
-    left = np.zeros(len(rows))
     for term in COST_TERMS:
-        part = np.array([row[term.field] for row in rows])
-        ax.barh(
-            y,
-            np.minimum(left + part, limit) - np.minimum(left, limit),
-            0.66,
-            np.minimum(left, limit),
-            color=term.color,
-        )
-        left += part
+        right = left + np.array([row[term.field] for row in rows])
+        start = np.minimum(left, limit)
+        ax.barh(y, np.minimum(right, limit) - start, 0.66, start, color=term.color)
+        left = right
     for i, row in enumerate(rows):
         low, high = _interval(row)
-        cut = total[i] > limit
-        if low < limit and not cut:
+        if total[i] > limit:
+            _draw_break(ax, i, limit)
+        elif low < limit:
             ax.plot([low, min(high, limit)], [i, i], color=INK, linewidth=1.3, solid_capstyle="butt")
             ends = [end for end in (low, high) if end <= limit]
             ax.plot(ends, [i] * len(ends), linestyle="none", marker="|", color=INK, markersize=6)
-        if cut:
-            _draw_break(ax, i, limit)
-        weight = "bold" if total[i] == total.min() else "normal"
         ax.annotate(
-            f"{total[i]:,.0f} s",
-            (1.0, i),
-            (44, 0),
-            xycoords=ax.get_yaxis_transform(),
-            textcoords="offset points",
-            va="center",
-            ha="right",
-            weight=weight,
-            annotation_clip=False,
-        )
+            f"{total[i]:,.0f} s", (1.0, i), (44, 0), xycoords=ax.get_yaxis_transform(), textcoords="offset points",
+            va="center", ha="right", weight="bold" if total[i] == total.min() else "normal", annotation_clip=False,
+        )  # fmt: skip
     if all(row.get("bound_s") is not None for row in rows):
         bound = float(np.mean([row["bound_s"] for row in rows]))
         ax.axvline(bound, color=INK, linestyle=(0, (3, 2)), linewidth=1.2, zorder=3)
-    ax.set(xlim=(0, limit), ylim=(len(rows) - 0.5, -0.5))
     ax.set_yticks(y, [row["agent"] for row in rows])
     ax.tick_params(axis="y", length=0)
     ax.spines["left"].set_visible(False)
-    ax.grid(axis="x")
 
 
 def _draw_break(ax: Axes, y: float, limit: float) -> None:
@@ -153,197 +144,211 @@ def _draw_break(ax: Axes, y: float, limit: float) -> None:
 
 
 def draw_time_against_occupancy(rows: Sequence[Row], about: str = "") -> Figure:
-    """Draw the total time against occupancy: a panel per failure cost, a line per agent.
-
-    Args:
-        rows: rows with occupancy (0..1), agent, failure_cost_s, total_s, total_s_ci95.
-        about: what else the rows have in common; follows the failure cost in the titles.
-    """
-    _require_rows(rows)
-    costs = sorted({row["failure_cost_s"] for row in rows})
-    columns = min(len(costs), 2)
-    lines = -(-len(costs) // columns)
+    """Draw the total time against occupancy: a panel per failure cost, a line per agent."""
     limit = _limit(rows)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.0 if columns == 1 else 10.0, 0.4 + 3.7 * lines), layout="constrained")
-        axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
-        for ax, cost in zip(axes.flat, costs, strict=False):
-            its = [row for row in rows if row["failure_cost_s"] == cost]
-            _draw_lines(ax, its, limit, lambda row: 100.0 * float(row["occupancy"]))
-            ax.set_title(f"failure cost {cost:g} s{about}")
-            ax.set_xlabel("occupancy at the arrival, %")
-        for ax in axes.flat[len(costs) :]:
-            ax.remove()
-        for ax in axes[:, 0]:
-            ax.set_ylabel("mean total time, s; 95 % interval")
-        _name(figure, rows)
-    return figure
-
-
-def draw_time_against_decision_time(panels: Mapping[str, Sequence[Row]]) -> Figure:
-    """Draw the total time against that of a decision: a panel per scenario, a line per planner; oracles are left out.
-
-    Args:
-        panels: rows of each scenario with planner, total_s, total_s_ci95 and decision_ms, the median.
-    """
-    panels = {name: [row for row in rows if row["agent"] not in UNBEATEN] for name, rows in panels.items()}
-    _require_rows([row for rows in panels.values() for row in rows])
-    columns = min(len(panels), 4)
-    lines = -(-len(panels) // columns)
-    planners = list(dict.fromkeys(row["planner"] for rows in panels.values() for row in rows))
-    width = max(3.0 * columns, 4.6)
-    keys = legend_columns(planners, width, min(len(planners), 2 + columns))
-    with mpl.rc_context(STYLE):
-        size = width, 2.7 * lines + 0.2 * -(-len(planners) // keys)
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(lines, columns, squeeze=False, sharex=True)
-        for ax, (name, rows) in zip(axes.flat, panels.items(), strict=False):
-            # The first planner lies on top of the others.
-            for order, planner in enumerate(reversed(planners)):
-                own = sorted(
-                    (r for r in rows if r["planner"] == planner), key=lambda r: float(r["decision_ms"])
-                )
-                _draw_in_time(ax, own, agent_color(planner.partition("(")[0]), 2.0 + 0.01 * order)
-            episodes = {row["episodes"] for row in rows}
-            each = f" ({plural(episodes.pop(), 'search', 'searches')})" if len(episodes) == 1 else ""
-            ax.set_title(f"{name}{each}", weight="bold")
-            ax.set(xscale="log")
-            ax.xaxis.set_major_formatter("{x:g}")
-            ax.xaxis.set_minor_formatter(NullFormatter())
-            ax.grid(axis="y")
-        for ax in axes.flat[len(panels) :]:
-            ax.remove()
-        for i, ax in enumerate(axes.flat[: len(panels)]):
-            if i % columns == 0:
-                ax.set_ylabel("mean total time, s; 95 % interval")
-            if i + columns >= len(panels):
-                ax.tick_params(labelbottom=True)
-                ax.set_xlabel("time of a decision, ms")
-        handles = [
-            Line2D([], [], color=agent_color(p.partition("(")[0]), linewidth=2.0, marker="o", label=p)
-            for p in planners
-        ]
-        figure.legend(handles=handles, loc="outside lower center", ncols=keys, columnspacing=1.4)
-    return figure
-
-
-def _draw_in_time(ax: Axes, rows: Sequence[Row], color: str, order: float) -> None:
-    """Draw a planner's totals with their intervals; one that takes no longer for more is also a level line."""
-    x = np.array([row["decision_ms"] for row in rows])
-    total = np.array([row["total_s"] for row in rows])
-    low, high = np.array([_interval(row) for row in rows], dtype=np.float64).reshape(-1, 2).T
-    ax.errorbar(
-        x, total, [total - low, high - total], color=color, linewidth=1.8, marker="o", markersize=4.0,
-        elinewidth=1.0, capsize=2.0, zorder=order,
-    )  # fmt: skip
-    if len(rows) == 1:
-        ax.axhline(total[0], color=color, linestyle=(0, (1, 2)), linewidth=1.0, zorder=order - 1.0)
+    panels = [
+        _lines(
+            [row for row in rows if row["failure_cost_s"] == cost],
+            lambda row: 100.0 * float(row["occupancy"]),
+            f"failure cost {cost:g} s{about}",
+            limit,
+            xlabel="occupancy at the arrival, %",
+        )
+        for cost in sorted({row["failure_cost_s"] for row in rows})
+    ]
+    columns = min(len(panels), 2)
+    size = 6.0 if columns == 1 else 10.0, 0.4 + 3.7 * -(-len(panels) // columns)
+    return draw_panels(panels, size, columns, _name(rows), share="y", label={"y": _TOTAL}, bold=True)
 
 
 def draw_time_against_failure_cost(observed: Sequence[Row], blind: Sequence[Row]) -> Figure:
-    """Draw the total time against the failure cost, with and without observations of slots before an attempt.
+    """Draw the total time against the failure cost, with and without observations of slots before an attempt."""
 
-    Args:
-        observed: rows of one scenario with failure_cost_s, agent, total_s, total_s_ci95.
-        blind: the same without observations from the lane.
-    """
-    _require_rows(observed)
-    _require_rows(blind)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 4.2), layout="constrained")
-        panels = (
-            ("slots observed from the lane", observed),
-            ("no observation before an attempt (agents that can)", blind),
-        )
-        for ax, (title, rows) in zip(figure.subplots(1, 2), panels, strict=True):
-            _draw_lines(ax, rows, _limit(rows), lambda row: float(row["failure_cost_s"]))
-            last = max(row["failure_cost_s"] for row in rows)
-            # A symmetric log scale includes a cost of 0.
-            ax.set_xscale("symlog", linthresh=1.0, linscale=0.4)
-            ticks = [tick for tick in (0, 1, 2, 5, 10, 20, 50, 100) if tick <= last]
-            ax.set(xlim=(0.0, 1.08 * last), xticks=ticks, xticklabels=[str(tick) for tick in ticks])
-            ax.minorticks_off()
-            ax.set_title(title)
-            ax.set_xlabel("failure cost, s (in the world and in the planners' models)")
-            ax.set_ylabel("mean total time, s; 95 % interval")
-        _name(figure, observed)
-    return figure
+    def panel(rows: Sequence[Row], title: str) -> Panel:
+        last = max(row["failure_cost_s"] for row in rows)
+        ticks = [tick for tick in (0, 1, 2, 5, 10, 20, 50, 100) if tick <= last]
+        labels: dict[str, Any] = {
+            "xlabel": "failure cost, s (in the world and in the planners' models)",
+            "ylabel": _TOTAL,
+        }
+        axes: dict[str, Any] = {
+            "xlim": (0.0, 1.08 * last),
+            "xticks": ticks,
+            "xticklabels": [str(tick) for tick in ticks],
+        }
+        lines = _lines(rows, lambda row: float(row["failure_cost_s"]), title, _limit(rows), **axes, **labels)
+        return lines._replace(marks=[*lines.marks, _scale_by_decades])
+
+    panels = [
+        panel(observed, "slots observed from the lane"),
+        panel(blind, "no observation before an attempt (agents that can)"),
+    ]
+    return draw_panels(panels, (11.0, 4.2), 2, _name(observed), bold=True)
+
+
+def _scale_by_decades(ax: Axes) -> None:
+    # A symmetric log scale includes a cost of 0.
+    ax.set_xscale("symlog", linthresh=1.0, linscale=0.4)
+    ax.minorticks_off()
 
 
 def draw_time_against_map(rows: Sequence[Row], own: Sequence[Row], forecast: Mapping[str, float]) -> Figure:
-    """Draw the total time against a forecast that is the same for every slot.
-
-    Args:
-        rows: rows with scenario, agent, total_s, total_s_ci95, of one world with several flat forecasts.
-        own: rows of the same world with its own forecast, drawn dashed.
-        forecast: P(taken) of each flat forecast, by scenario.
-    """
-    _require_rows(rows)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.6, 4.2), layout="constrained")
-        ax = figure.subplots()
-        limit = _limit(rows)
-        _draw_lines(ax, rows, limit, lambda row: 100.0 * forecast[row["scenario"]])
-        for row in own:
-            color = agent_color(row["agent"])
-            ax.axhline(row["total_s"], color=color, linewidth=0.9, linestyle=(0, (2, 3)), zorder=1)
-        ax.set_title("dashed: with the scenario's own forecast")
-        ax.set_xlabel("forecast P(taken) of every slot, %")
-        ax.set_ylabel("mean total time, s; 95 % interval")
-        _name(figure, own or rows)
-    return figure
+    """Draw the total time against a forecast that is the same for every slot."""
+    title = "dashed: with the scenario's own forecast"
+    labels = {"xlabel": "forecast P(taken) of every slot, %", "ylabel": _TOTAL}
+    lines = _lines(rows, lambda row: 100.0 * forecast[row["scenario"]], title, _limit(rows), **labels)
+    dashed = [
+        level(row["total_s"], agent_color(row["agent"]), linewidth=0.9, linestyle=(0, (2, 3)), zorder=1)
+        for row in own
+    ]
+    panel = lines._replace(marks=[*lines.marks, *dashed])
+    return draw_panels([panel], (6.6, 4.2), 1, _name(own or rows), bold=True)
 
 
-def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Row], float]) -> None:
-    """Draw a line per agent; `along` returns a row's x value."""
-    ends = []
-    places = [along(row) for row in rows]
+def _lines(
+    rows: Sequence[Row], along: Callable[[Row], float], title: str, limit: float, **axes: Any
+) -> Panel:
+    """Return a panel with a line per agent, named at its end; `along` returns a row's x value."""
+    lines, ends = [], []
     for agent in dict.fromkeys(row["agent"] for row in rows):
         own = sorted((row for row in rows if row["agent"] == agent), key=along)
-        color = agent_color(agent)
-        x = np.array([along(row) for row in own])
-        total = np.array([row["total_s"] for row in own])
-        # NaN where there is no interval, e.g. of a single search: no band there.
-        low, high = np.array([row["total_s_ci95"] for row in own], dtype=np.float64).T
+        x, total = (np.array([value(row) for row in own]) for value in (along, lambda row: row["total_s"]))
+        # NaN where there is no interval, and where the line is beyond the limit: no band there.
+        band = np.array([row["total_s_ci95"] for row in own], dtype=np.float64).T
+        band[:, total > limit] = np.nan
         dashes = (0, (4, 2)) if agent in UNBEATEN else "-"
-        # The interval of a line beyond the limit would only cover the others.
-        ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.07, linewidth=0)
-        ax.plot(x, total, color=color, linestyle=dashes, linewidth=1.8, marker="o", markersize=3.5)
-        ends.append((total[-1], x[-1], agent, color))
-    ax.set(xlim=(min(places) - 1.0, max(places) + 1.0), ylim=(0, limit))
-    ends.sort()
+        style = {"linestyle": dashes, "linewidth": 1.8, "marker": "o", "markersize": 3.5}
+        lines.append(Line(x, total, agent_color(agent), style, (band[0], band[1]), 0.07))
+        ends.append((total[-1], x[-1], agent))
+    ends_x = [along(row) for row in rows]
+    axes = {"xlim": (min(ends_x) - 1.0, max(ends_x) + 1.0), "ylim": (0, limit)} | axes
+    return Panel([*lines, partial(_name_ends, sorted(ends), limit)], title, axes, "y")
+
+
+def _name_ends(ends: Sequence[tuple[float, float, str]], limit: float, ax: Axes) -> None:
+    """Name lines, in ascending order of their ends, beside the axes."""
     heights = spread([min(total / limit, 1.0) for total, *_ in ends], 0.062)
-    for (total, x, agent, color), height in zip(ends, heights, strict=True):
-        off = total > limit
+    for (total, x, agent), height in zip(ends, heights, strict=True):
+        color, off = agent_color(agent), total > limit
         link = {"arrowstyle": "-", "color": color, "linewidth": 0.7, "relpos": (0, 0.5), "shrinkB": 3}
         ax.annotate(
-            f"{agent} ↑ {total:,.0f} s" if off else agent,
-            (x, min(total, limit)),
-            (1.035, height),
-            textcoords="axes fraction",
-            va="center",
-            color=color,
-            weight="bold",
-            fontsize=8.5,
-            arrowprops=None if off else link,
-            annotation_clip=False,
-        )
-    ax.grid(axis="y")
+            f"{agent} ↑ {total:,.0f} s" if off else agent, (x, min(total, limit)), (1.035, height),
+            textcoords="axes fraction", va="center", color=color, weight="bold", fontsize=8.5,
+            arrowprops=None if off else link, annotation_clip=False,
+        )  # fmt: skip
 
 
-def spread(places: Sequence[float], gap: float) -> FloatArray:
-    """Move ascending positions at least `gap` apart, as little as possible, and not above 1 if they fit."""
-    spread = np.array(places, dtype=np.float64)
-    for i in range(1, len(spread)):
-        spread[i] = max(spread[i], spread[i - 1] + gap)
-    spread[-1:] = np.minimum(spread[-1:], max(1.0, gap * (len(spread) - 1)))
-    for i in range(len(spread) - 2, -1, -1):
-        spread[i] = min(spread[i], spread[i + 1] - gap)
-    return spread
+def draw_time_against_decision_time(panels: Mapping[str, Sequence[Row]]) -> Figure:
+    """Draw the total time against that of a decision: a panel per scenario, a line per planner but the oracles."""
+    panels = {name: [row for row in rows if row["agent"] not in UNBEATEN] for name, rows in panels.items()}
+    planners = list(dict.fromkeys(row["planner"] for rows in panels.values() for row in rows))
+    if not planners:
+        raise InputError("no rows to draw")
+    columns = min(len(panels), 4)
+    width = max(3.0 * columns, 4.6)
+    keys = legend_columns(planners, width, min(len(planners), 2 + columns))
+    colors = {planner: agent_color(planner.partition("(")[0]) for planner in planners}
+    key = [key_line(name, color, linewidth=2.0, marker="o") for name, color in colors.items()]
+
+    def marks(rows: Sequence[Row]) -> Iterator[Any]:
+        # The first planner lies on top of the others.
+        for order, planner in enumerate(reversed(planners)):
+            own = sorted(
+                (row for row in rows if row["planner"] == planner), key=lambda row: row["decision_ms"]
+            )
+            x, total = (np.array([row[name] for row in own]) for name in ("decision_ms", "total_s"))
+            low, high = np.array([_interval(row) for row in own], dtype=np.float64).reshape(-1, 2).T
+            style = {
+                "linewidth": 1.8, "marker": "o", "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0,
+                "zorder": 2.0 + 0.01 * order,
+            }  # fmt: skip
+            color = colors[planner]
+            yield Line(x, total, color, style, interval=np.array([total - low, high - total]))
+            if len(own) == 1:  # it takes no longer for more
+                below: dict[str, Any] = {
+                    "linestyle": (0, (1, 2)),
+                    "linewidth": 1.0,
+                    "zorder": 1.0 + 0.01 * order,
+                }
+                yield level(total[0], color, **below)
+        yield _scale_by_log
+
+    size = width, 2.7 * -(-len(panels) // columns) + 0.2 * -(-len(planners) // keys)
+    return draw_panels(
+        [
+            Panel(list(marks(rows)), f"{name}{_each([row['episodes'] for row in rows])}", {}, "y", title_style=BOLD)
+            for name, rows in panels.items()
+        ],
+        size, columns, share="x", label={"x": "time of a decision, ms", "y": _TOTAL}, key=key,
+        key_style={"ncols": keys, "columnspacing": 1.4},
+    )  # fmt: skip
+
+
+def _scale_by_log(ax: Axes) -> None:
+    ax.set(xscale="log")
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter(NullFormatter())
+
+
+def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
+    """Draw the empirical distribution functions of total times, with each agent's mean as a dot on its curve."""
+    if not panels or not any(panels.values()):
+        raise InputError("no total times to draw")
+    columns = len(panels) if len(panels) < 4 else 2 if len(panels) == 4 else 3
+    names = list(dict.fromkeys(name for totals in panels.values() for name in totals))
+    width, mean = (4.6, 7.2, 9.6)[columns - 1], "mean (▸ beyond the axis)"
+    keys = legend_columns([*names, mean], width, min(len(names) + 1, 3 if columns == 1 else 5))
+    key = [key_line(name, linewidth=2.0, **_curve_style(name)) for name in names]
+    key.append(key_line(mean, "#777777", linestyle="none", marker="o", markersize=6, markeredgecolor="white"))
+    return draw_panels(
+        [
+            _distribution(totals, f"{name}{_each([len(times) for times in totals.values()])}")
+            for name, totals in panels.items()
+        ],
+        (width, 2.6 * -(-len(panels) // columns) + 0.3 + 0.2 * -(-(len(names) + 1) // keys)),
+        columns, share="y", label={"y": "searches that took at most this long, %"}, key=key,
+        key_style={"ncols": keys, "handlelength": 2.0, "columnspacing": 1.4},
+    )  # fmt: skip
+
+
+def _curve_style(name: str) -> dict[str, Any]:
+    dashed = name in ("oracle", BOUND)
+    return {"color": INK if dashed else agent_color(name), "linestyle": (0.0, (4.0, 2.0)) if dashed else "-"}
+
+
+def _distribution(totals: Totals, title: str) -> Panel:
+    everything = np.concatenate(list(totals.values()))
+    low, high = float(everything.min()), float(everything.max())
+    end = min(high, _AXIS_END * float(np.median(everything)))
+    margin = 0.04 * (end - low) or 1.0
+    limit = end + margin
+
+    marks = []
+    # The first agent lies on top of the others.
+    for order, name in enumerate(reversed(list(totals))):
+        style, times = _curve_style(name), np.sort(totals[name])
+        color = style.pop("color")
+        share = 100.0 * np.arange(1, len(times) + 1) / len(times)
+        x, y = np.r_[times[0], times, max(limit, times[-1])], np.r_[0.0, share, 100.0]
+        steps = {"drawstyle": "steps-post", "linewidth": 1.7, "zorder": 2 + 0.01 * order}
+        # A mean beyond the axis is a triangle at its end.
+        mean = min(float(times.mean()), limit)
+        height = 100.0 * float(np.searchsorted(times, mean, side="right")) / len(times)
+        dot = {
+            "marker": "o" if mean < limit else ">", "markersize": 6, "markeredgecolor": "white",
+            "markeredgewidth": 1.0, "zorder": 3 + 0.01 * order, "clip_on": False,
+        }  # fmt: skip
+        marks += [Line(x, y, color, steps | style), Line(mean, height, color, dot)]
+    longer = 100.0 * float(np.mean(everything > end))
+    note = f"; {longer:.0f} % longer, up to {high:,.0f} s" if longer >= 0.5 else ""
+    axes = {"xlim": (max(low - margin, 0.0), limit), "ylim": (0.0, 102.0), "yticks": [0, 25, 50, 75, 100]}
+    return Panel(marks, title, axes | {"xlabel": f"total time, s{note}"}, title_style=BOLD)
 
 
 def _limit(rows: Sequence[Row]) -> float:
     """Return the upper limit of the total-time axis: above all totals within `OFF_SCALE` medians."""
+    if not rows:
+        raise InputError("no rows to draw")
     total = np.array([row["total_s"] for row in rows])
     near = total[total <= OFF_SCALE * np.median(total)]
     return float(1.12 * near.max()) or 1.0
@@ -357,101 +362,197 @@ def _interval(row: Row) -> tuple[float, float]:
     return low, high
 
 
-def _require_rows(rows: Sequence[Row]) -> None:
-    if not rows:
-        raise InputError("no rows to draw")
-
-
-def _name(figure: Figure, rows: Sequence[Row]) -> None:
-    """Title a figure with the scenario if all rows share it."""
+def _name(rows: Sequence[Row]) -> str:
+    """Return the scenario that all rows share, as a title; empty if there are several."""
     names = {row.get("scenario") for row in rows} - {None}
-    episodes = {int(row["episodes"]) for row in rows if "episodes" in row}
-    if len(names) == 1:
-        each = f", {plural(episodes.pop(), 'search', 'searches')} each" if len(episodes) == 1 else ""
-        figure.suptitle(f"{names.pop()}{each}", x=0.01, ha="left", weight="bold")
+    each = _each([int(row["episodes"]) for row in rows if "episodes" in row]).strip(" ()")
+    return f"{names.pop()}{f', {each} each' if each else ''}" if len(names) == 1 else ""
 
 
-Totals = Mapping[str, FloatArray]
-"""Total times of each agent, (n_episodes,) s, by name."""
-
-BOUND = "clairvoyant lower bound"
-_AXIS_END = 2.5
-"""The time axis ends at this multiple of the median, so that rare long searches do not compress the rest."""
-_DASHED = ("oracle", BOUND)
+def _each(searches: Sequence[int]) -> str:
+    """Return the number of searches, in brackets; empty if it differs."""
+    return f" ({plural(searches[0], 'search', 'searches')})" if len(set(searches)) == 1 else ""
 
 
-def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
-    """Draw the empirical distribution functions of total times, with each agent's mean as a dot on its curve."""
-    if not panels or not any(panels.values()):
-        raise InputError("no total times to draw")
-    columns = len(panels) if len(panels) < 4 else 2 if len(panels) == 4 else 3
-    lines = -(-len(panels) // columns)
-    names = list(dict.fromkeys(name for totals in panels.values() for name in totals))
-    width, mean = (4.6, 7.2, 9.6)[columns - 1], "mean (▸ beyond the axis)"
-    keys = legend_columns([*names, mean], width, min(len(names) + 1, 3 if columns == 1 else 5))
-    with mpl.rc_context(STYLE):
-        size = width, 2.6 * lines + 0.3 + 0.2 * -(-(len(names) + 1) // keys)
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
-        for ax, (name, totals) in zip(axes.flat, panels.items(), strict=False):
-            _draw_panel(ax, totals)
-            episodes = {len(its) for its in totals.values()}
-            each = f" ({plural(episodes.pop(), 'search', 'searches')})" if len(episodes) == 1 else ""
-            ax.set_title(f"{name}{each}", weight="bold")
-        for ax in axes.flat[len(panels) :]:
-            ax.remove()
-        for i, ax in enumerate(axes.flat[: len(panels)]):
-            if i % columns == 0:
-                ax.set_ylabel("searches that took at most this long, %")
-        handles = [
-            Line2D([], [], color=_color(name), linestyle=_dashes(name) or "-", linewidth=2.0, label=name)
-            for name in names
+FIXED, NONE = "fixed", "none"
+"""Column `map` of the references: a right map that does not learn; an agent that uses no map."""
+_WORDS = {"empty": "empty map at first", "right": "right map at first", "wrong": "wrong map at first"}
+_DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))
+"""Lines of an agent with different options."""
+_FIXED_LINE: dict[str, Any] = {"linewidth": 1.2, "linestyle": (0, (1, 1))}
+_INK = "#444444"
+_NONE_LINE: dict[str, Any] = {"linewidth": 1.4, "linestyle": (0, (4, 2))}
+
+
+def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
+    """Draw a column of panels for each scenario and map: time and forecast error of each agent against the day.
+
+    Excess time is what a search takes beyond that of the first agent with the right map, which does not learn, in the
+    same worlds (10 % trimmed mean). Shaded are 95 % intervals. All of the first agent's curve is in the panel; others
+    may leave it.
+    """
+    columns = list(dict.fromkeys((r["scenario"], r["map"]) for r in rows if r["map"] not in (FIXED, NONE)))
+    if not columns:
+        return
+    above, below = list[Panel](), list[Panel]()
+    for scenario, start in columns:
+        its = {
+            m: [r for r in rows if (r["scenario"], r["map"]) == (scenario, m)] for m in (start, NONE, FIXED)
+        }
+        right = [row for row in its[FIXED] if row["agent"] == its[FIXED][0]["agent"]]
+        last = max(row["day"] for row in rows if row["scenario"] == scenario)
+        axes: dict[str, Any] = {"xlim": (0.5, last + 0.5)}
+        zero = f"0 = {right[0]['agent']}, right map: {np.mean([row['total_s'] for row in right]):.0f} s"
+        excess, limits = _excess(its[start], its[NONE])
+        above.append(Panel(excess, f"{scenario}, {_WORDS[start]}\n{zero}", axes | {"ylim": limits}, "y"))
+        error: list[Mark] = [
+            Line(
+                [row["day"] for row in right],
+                [row["forecast_error"] for row in right],
+                _INK,
+                _FIXED_LINE | {"zorder": 1},
+            ),
+            *_bands(its[start], "forecast_error"),
+            lambda ax: ax.xaxis.set_major_locator(MaxNLocator(integer=True)),
         ]
-        handles.append(
-            Line2D(
-                [], [], linestyle="none", marker="o", markersize=6, color="#777777", markeredgecolor="white",
-                label=mean,
-            )
-        )  # fmt: skip
-        figure.legend(
-            handles=handles, loc="outside lower center", ncols=keys, handlelength=2.0, columnspacing=1.4
+        below.append(Panel(error, "", axes | {"xlabel": "day", "ylim": (0.0, None)}, "y"))
+    learn = [row for row in rows if row["map"] not in (FIXED, NONE)]
+    colors = {row["agent"]: _color(row["agent"]) for row in rows}
+    key = [
+        key_line(f"{a}, learning", colors[a], linewidth=2.0, linestyle=d) for a, d in _dashes(learn).items()
+    ]
+    without = dict.fromkeys(row["agent"] for row in rows if row["map"] == NONE)
+    key += [key_line(f"{agent}, no map", colors[agent], **_NONE_LINE) for agent in without]
+    key.append(key_line("right map that does not learn", _INK, **_FIXED_LINE))
+    size = 1.2 + max(2.9 * len(columns), 4.4), 5.6
+    keys = {"ncols": max(2, int(size[0] // 2.2))}
+    figure = draw_panels([*above, *below], size, len(columns), share="column", key=key, key_style=keys)
+    figure.axes[0].set_ylabel("excess time, s (trimmed mean)")
+    figure.axes[len(columns)].set_ylabel("forecast error (Brier score)")
+    save_picture(figure, path, "Time and forecast error of drivers whose map learns from every trip")
+
+
+def _excess(learned: Sequence[Row], others: Sequence[Row]) -> tuple[list[Mark], tuple[float, float]]:
+    """Return the excess of learning agents and of those without a map, and limits of the axis.
+
+    Lines far above are named at the top.
+    """
+    levels = {
+        agent: float(np.mean([row["excess_s"] for row in others if row["agent"] == agent]))
+        for agent in dict.fromkeys(row["agent"] for row in others)
+    }
+    first = [row["excess_s"] for row in learned if row["agent"] == learned[0]["agent"]]
+    nearest = min(levels.values(), default=0.0)
+    low, high = np.percentile([row["excess_s"] for row in learned], [10.0, 90.0])
+    top, bottom = max(*first, nearest, high, 1.0), min(*first, nearest, low, 0.0)
+    margin = 0.2 * (top - bottom)
+    far = {agent: excess for agent, excess in levels.items() if excess > top + margin}
+    words = "\n".join(f"{agent} \N{UPWARDS ARROW} {excess:+.0f} s" for agent, excess in far.items())
+
+    def name_far(ax: Axes) -> None:
+        ax.text(0.98, 0.97, words, transform=ax.transAxes, ha="right", va="top", color="#444444")
+
+    marks: list[Mark] = [level(0.0, "#444444", linewidth=0.9, zorder=1), *_bands(learned, "excess_s")]
+    marks += [
+        level(excess, _color(agent), **_NONE_LINE, zorder=1)
+        for agent, excess in levels.items()
+        if agent not in far
+    ]
+    return [*marks, name_far], (bottom - margin, top + margin)
+
+
+def _bands(rows: Sequence[Row], measure: str) -> Iterator[Line]:
+    """Yield the line of a measure of each learning agent, with its 95 % interval."""
+    for agent, dashes in _dashes(rows).items():
+        its = [row for row in rows if row["agent"] == agent]
+        low, high = np.array([row[f"{measure}_ci95"] for row in its], float).T
+        style = {"linewidth": 1.8, "linestyle": dashes}
+        mean = [row[measure] for row in its]
+        yield Line([row["day"] for row in its], mean, _color(agent), style, (low, high), 0.18)
+
+
+def _color(agent: str) -> str:
+    return agent_color(agent.partition("(")[0])
+
+
+def _dashes(rows: Sequence[Row]) -> dict[str, Any]:
+    """Return the line of each agent: agents of one colour have different ones."""
+    colors = {row["agent"]: _color(row["agent"]) for row in rows}
+    alike = {color: [agent for agent in colors if colors[agent] == color] for color in colors.values()}
+    return {agent: _DASHES[alike[color].index(agent) % len(_DASHES)] for agent, color in colors.items()}
+
+
+TRAINING_COLORS = (*COLORS, "#555555")
+"""Colours of trainings: as many as are easy to tell apart."""
+OFF_CURVES = 2.0
+"""Times above this multiple of the lowest are cut off."""
+_NAMES_APART = 0.045  # least distance of two labels, fraction of the axis
+_MARGIN_IN = 0.12  # beside the labels, inches
+
+
+def save_learning_curves(
+    curves: Mapping[str, Sequence[Sequence[Row]]],
+    means: Mapping[str, Sequence[Row]],
+    planners: Mapping[str, float],
+    title: str,
+    path: Path,
+) -> None:
+    """Draw each algorithm's total time, and planners as horizontal lines.
+
+    A single algorithm is drawn as the mean over seeds with its interval. Several are drawn as medians: their intervals
+    would hide each other, and medians are robust against single searches that drive in circles. Single seeds are thin
+    lines.
+    """
+    alone, lines, highest = len(curves) == 1, list[Line](), 0.0
+    for (name, seeds), color in zip(curves.items(), TRAINING_COLORS, strict=False):
+        for single in seeds:
+            steps, total = [r["steps"] for r in single], [r["total_s"] for r in single]
+            lines.append(Line(steps, total, color, {"linewidth": 0.5, "alpha": 0.35}))
+        rows = means[name]
+        mean = [row["total_s" if alone else "median_s"] for row in rows]
+        words = f"{'' if alone or len(seeds) == 1 else 'median of '}{len(seeds)} seeds"
+        ends = [row["low_s"] for row in rows], [row["high_s"] for row in rows]
+        style, band = (
+            {"linewidth": 2.0, "label": f"{name}, {words}"},
+            ends if alone and len(seeds) > 1 else None,
         )
-    return figure
+        lines.append(Line([row["steps"] for row in rows], mean, color, style, band))
+        highest = max([highest, *mean[len(mean) // 10 :]])
+    low = min(
+        [*planners.values(), *(row["total_s"] for its in curves.values() for seed in its for row in seed)]
+    )
+    # An untrained policy drives in circles, so cut off high values to keep the end of the curves readable.
+    high = min(max([highest, *planners.values()]), OFF_CURVES * low)
+    margin = 0.06 * (high - low) or 1.0
+    bottom, top = low - margin, high + margin
+
+    def mark_planners(ax: Axes) -> None:
+        shown = sorted(((t, name) for name, t in planners.items() if t <= top), key=lambda pair: pair[0])
+        for (seconds, name), height in zip(
+            shown,
+            spread([(seconds - bottom) / (top - bottom) for seconds, _ in shown], _NAMES_APART),
+            strict=True,
+        ):
+            ax.axhline(seconds, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
+            ax.annotate(
+                f"{name}  {seconds:.1f}", (1.0, height), xycoords="axes fraction", xytext=(5, 0),
+                textcoords="offset points", va="center", fontsize=8, color=INK,
+            )  # fmt: skip
+
+    labels = {"xlabel": "decisions in training", "ylabel": "mean total time, s"}
+    key = {
+        "loc": "upper right", "frameon": True, "facecolor": "white", "edgecolor": "none", "framealpha": 1.0,
+    } if alone else None  # fmt: skip
+    axes = {"xlim": (0.0, None), "ylim": (bottom, top)} | labels
+    panel = Panel([*lines, mark_planners], title, axes, "y", key)
+    size, caption = (7.2, 4.2 if alone else 4.8), "Learning curves, and planners in the same worlds"
+    with picture(path, size, caption, ConstrainedLayoutEngine(w_pad=_MARGIN_IN)) as figure:
+        ax = figure.subplots()
+        panel.draw(ax)
+        ax.xaxis.set_major_formatter(_count)
+        if not alone:
+            figure.legend(loc="outside lower left", ncols=2, frameon=False)
 
 
-def _draw_panel(ax: Axes, totals: Totals) -> None:
-    everything = np.concatenate(list(totals.values()))
-    low, high = float(everything.min()), float(everything.max())
-    end = min(high, _AXIS_END * float(np.median(everything)))
-    margin = 0.04 * (end - low) or 1.0
-    limit = end + margin
-    # Draw the first agent on top of the others.
-    for order, name in enumerate(reversed(list(totals))):
-        times = np.sort(totals[name])
-        share = 100.0 * np.arange(1, len(times) + 1) / len(times)
-        x, y = np.r_[times[0], times, max(limit, times[-1])], np.r_[0.0, share, 100.0]
-        ax.step(
-            x, y, where="post", color=_color(name), linestyle=_dashes(name) or "-", linewidth=1.7,
-            zorder=2 + 0.01 * order,
-        )  # fmt: skip
-        # Show a mean beyond the axis as a triangle at its end.
-        mean = float(times.mean())
-        at = min(mean, limit)
-        height = 100.0 * float(np.searchsorted(times, at, side="right")) / len(times)
-        ax.plot(
-            at, height, marker="o" if mean < limit else ">", markersize=6, color=_color(name),
-            markeredgecolor="white", markeredgewidth=1.0, zorder=3 + 0.01 * order, clip_on=False,
-        )  # fmt: skip
-    ax.set(xlim=(max(low - margin, 0.0), limit), ylim=(0.0, 102.0), yticks=[0, 25, 50, 75, 100])
-    longer = 100.0 * float(np.mean(everything > end))
-    note = f"; {longer:.0f} % longer, up to {high:,.0f} s" if longer >= 0.5 else ""
-    ax.set_xlabel(f"total time, s{note}")
-    ax.grid(axis="both")
-
-
-def _color(name: str) -> str:
-    return INK if name in _DASHED else agent_color(name)
-
-
-def _dashes(name: str) -> tuple[float, Sequence[float]] | None:
-    return (0.0, (4.0, 2.0)) if name in _DASHED else None
+def _count(x: float, _: Any) -> str:
+    return f"{x / 1e6:g} M" if x >= 1e6 else f"{x / 1e3:g} k" if x >= 1e3 else f"{x:g}"

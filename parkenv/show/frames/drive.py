@@ -18,18 +18,7 @@ from parkenv.show.colors import FREE, mixed_color
 from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, painted_finely, strip, write_line
 from parkenv.show.frames.window import Window
 from parkenv.show.painters.opencv import MapView, paint
-from parkenv.show.scene import (
-    REAR_WINDOW,
-    SQUARE,
-    WINDSCREEN,
-    Areas,
-    Layer,
-    Lines,
-    LotScene,
-    Marks,
-    building_layers,
-    cars,
-)
+from parkenv.show.scene import SQUARE, Areas, Layer, Lines, LotScene, Marks, building_layers, cars
 from parkenv.world.lot import ParkingLot, corner_points
 
 LARGEST_SCALE = 26.0  # px/m
@@ -43,14 +32,7 @@ _NOSE = np.array([[0.5, 0.0], [-0.3, 0.55], [-0.1, 0.0], [-0.3, -0.55]])
 
 
 class DriveRenderer:
-    """Renderer of parking manoeuvres on one lot, to scale.
-
-    Args:
-        lot: the lot.
-
-    Attributes:
-        window: shows frames on the screen.
-    """
+    """Renderer of parking manoeuvres on one lot, to scale."""
 
     def __init__(self, lot: ParkingLot) -> None:
         self._scene = LotScene.of(lot)
@@ -59,12 +41,7 @@ class DriveRenderer:
         self.window = Window(f"parkenv: driving on {lot.name}")
 
     def frame(self, state: DriveState, outlines: Sequence[FloatArray] = ()) -> Image:
-        """Render the current state, (480, 640, 3) uint8 RGB.
-
-        Args:
-            state: state of an environment on the renderer's lot.
-            outlines: outlines of the moving road users, (k, 2) m each, in their own frames.
-        """
+        """Render the current state, (480, 640, 3) uint8 RGB."""
         task = state.task
         if task is not self._task:
             self._task, self._center = task, None
@@ -105,7 +82,7 @@ def _movers(poses: FloatArray, outlines: Sequence[FloatArray]) -> list[Layer]:
         size = np.ptp(outline, axis=0)
         layers.append(Areas([[placed(outline, pose)]], "mover", "white", 1.2))
         if size[0] > 2.0:
-            layers += _panes(pose[None], size)
+            layers += cars(pose[None], "mover", size, glass="glass")[1:]
     return layers
 
 
@@ -123,10 +100,6 @@ def steered_car(vehicle: VehicleParameters, state: FloatArray) -> list[Layer]:
     tyres = Marks(np.array(wheels), SQUARE, "ink", _TYRE)
     # The wheels are below the body, above its border.
     return [*cars(pose, "car", size, edge="ink")[:1], tyres, *cars(pose, "car", size)]
-
-
-def _panes(poses: FloatArray, size: FloatArray) -> list[Layer]:
-    return [Marks(poses, pane, "glass", size) for pane in (WINDSCREEN, REAR_WINDOW)]
 
 
 def trail(vehicle: VehicleParameters, poses: FloatArray) -> list[Layer]:
@@ -169,7 +142,8 @@ def _parked(outline: FloatArray) -> list[Layer]:
     length, width = np.hypot(side[:, 0], side[:, 1]).tolist()
     along = side[0] if length > width else side[1]
     pose = np.array([[*box[:4].mean(axis=0), math.atan2(along[1], along[0])]])
-    return [Areas([[outline]], "parked"), *_panes(pose, np.array([max(length, width), min(length, width)]))]
+    size = max(length, width), min(length, width)
+    return [Areas([[outline]], "parked"), *cars(pose, "parked", size, glass="glass")[1:]]
 
 
 def _line(state: DriveState) -> Image:

@@ -18,14 +18,7 @@ SMALLEST_CAR = 7.0  # length, px
 
 
 class FleetRenderer:
-    """Renderer of a fleet: the whole lot, cars that search (yellow), cars of the fleet that are parked (blue), others.
-
-    Args:
-        fleet: the fleet.
-
-    Attributes:
-        window: shows frames on the screen.
-    """
+    """Renderer of a fleet: the whole lot, cars that search (yellow), those that have parked (blue), and others."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.fleet = fleet

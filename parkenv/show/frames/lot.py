@@ -53,17 +53,11 @@ PIXELS = MapView(np.eye(2), 1.0, np.zeros(2))
 
 _LINE_WIDTH = 0.14  # m, paint between slots
 _EDGE = 3.0  # m, around the lot's features
-_CAR_EDGE, _NEAR = (
-    0.12,
-    8.0,
-)  # m; px/m from which parked cars have a light edge, visible on slots of any colour
+_CAR_EDGE, _NEAR = 0.12, 8.0  # m; px/m from which parked cars have a light edge, visible on any colour
 
 
 def clock(time: float) -> str:
     """Weekday and time of day.
-
-    Args:
-        time: s since Monday 00:00.
 
     Examples:
         >>> clock(86400.0 + 34867.0)
@@ -94,13 +88,6 @@ class LotFrames:
     grow with the number of slots. If slots would be less than `smallest_slot` px wide, a picture shows a window around
     a place, which moves in steps of half its size.
 
-    Args:
-        lot: the lot.
-        size: width and height of the pictures, px.
-        smallest_slot: px; 0: always the whole lot.
-
-    Attributes:
-        whole: view of the whole lot; None if pictures show a window.
     """
 
     def __init__(
@@ -134,13 +121,7 @@ class LotFrames:
         return self._still
 
     def slots(self, place: FloatArray, colors: Image, taken: NDArray[np.bool_]) -> Image:
-        """Return a picture of the lot.
-
-        Args:
-            place: (2,) m, what a window shows.
-            colors: (n_slots, 3) uint8, colours of the slots.
-            taken: (n_slots,) bool, whether a car stands in it.
-        """
+        """Return a picture of the lot."""
         still = self.still(place)
         image = still.image.copy()
         _paint_slots(
@@ -177,22 +158,21 @@ def lot_corners(lot: ParkingLot) -> FloatArray:
     return np.array([[low_x - _EDGE, low_y - _EDGE], [high_x + _EDGE, high_y + _EDGE]])
 
 
-def painted_finely(view: MapView, size: tuple[int, int], layers: Sequence[Layer]) -> Image:
-    """Paint layers on the ground at `SUPERSAMPLING` times the resolution; return that image, not yet averaged."""
-    width, height = size
-    image = np.full((height * SUPERSAMPLING, width * SUPERSAMPLING, 3), PALETTE["ground"], dtype=np.uint8)
-    paint(image, view.finer(), layers)
+def painted_finely(
+    view: MapView,
+    size: tuple[int, int],
+    layers: Sequence[Layer],
+    ground: str = "ground",
+    times: int = SUPERSAMPLING,
+) -> Image:
+    """Paint layers at so many times the resolution; return that image, not yet averaged."""
+    image = np.full((size[1] * times, size[0] * times, 3), PALETTE[ground], dtype=np.uint8)
+    paint(image, view.finer(times), layers)
     return image
 
 
 def draw_still_layer(scene: LotScene, view: MapView, size: tuple[int, int]) -> StillLayer:
-    """Draw everything static at `SUPERSAMPLING` times the resolution, and average it down.
-
-    Args:
-        scene: the lot.
-        view: map view of the frame.
-        size: width and height of the map, px.
-    """
+    """Draw everything static at `SUPERSAMPLING` times the resolution, and average it down."""
     width, height = size
     lot, fine = scene.lot, view.finer()
     at = view(lot.slot_xy)
@@ -215,14 +195,17 @@ def draw_still_layer(scene: LotScene, view: MapView, size: tuple[int, int]) -> S
     bodies, *panes = (
         fixed_point(fine(placed_shape(part, poses, car_size))) for part in (CAR_BODY, WINDSCREEN, REAR_WINDOW)
     )
+    fills = (
+        (image, boxes, PALETTE["paint"]),
+        (cars, edges, PALETTE["paint"]),
+        (has_car, edges, 1),
+        (cars, bodies, PALETTE["parked"]),
+        *((cars, pane, PALETTE["glass"]) for pane in panes),
+    )
     for i in range(len(slots)):
-        cv2.fillConvexPoly(image, boxes[i], PALETTE["paint"], 8, SUBPIXEL_BITS)
         cv2.fillConvexPoly(label, boxes[i], i, 8, SUBPIXEL_BITS)
-        cv2.fillConvexPoly(cars, edges[i], PALETTE["paint"], 8, SUBPIXEL_BITS)
-        cv2.fillConvexPoly(has_car, edges[i], 1, 8, SUBPIXEL_BITS)
-        cv2.fillConvexPoly(cars, bodies[i], PALETTE["parked"], 8, SUBPIXEL_BITS)
-        for pane in panes:
-            cv2.fillConvexPoly(cars, pane[i], PALETTE["glass"], 8, SUBPIXEL_BITS)
+        for canvas, corners, color in fills:
+            cv2.fillConvexPoly(canvas, corners[i], color, 8, SUBPIXEL_BITS)
 
     blocks = _blocks(label)
     owner = blocks.max(axis=-1)
@@ -233,16 +216,9 @@ def draw_still_layer(scene: LotScene, view: MapView, size: tuple[int, int]) -> S
     colors = np.stack([_blocks(cars[..., c]).reshape(-1, SUPERSAMPLING**2)[pixel] for c in range(3)], axis=-1)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     _draw_north(small, view)
-    return StillLayer(
-        view=view,
-        image=small,
-        slots=slots,
-        pixel=pixel,
-        slot=owner.astype(np.int64),
-        cover=own.mean(axis=1, dtype=np.float32),
-        car=(colors * cars_here[..., None]).mean(axis=1, dtype=np.float32),
-        car_cover=cars_here.mean(axis=1, dtype=np.float32),
-    )
+    car = (colors * cars_here[..., None]).mean(axis=1, dtype=np.float32)
+    cover, car_cover = (of_pixel.mean(axis=1, dtype=np.float32) for of_pixel in (own, cars_here))
+    return StillLayer(view, small, slots, pixel, owner.astype(np.int64), cover, car, car_cover)
 
 
 def _blocks(fine: NDArray[Any]) -> NDArray[Any]:
@@ -287,15 +263,7 @@ def write_line(
     color: str | Color = "car",
     room: int = 0,
 ) -> None:
-    """Write a line of text, and the first verdict that fits, on a strip.
-
-    Args:
-        image: (h, w, 3) uint8, written upon.
-        parts: texts, side by side.
-        verdicts: how it ended, the longest first.
-        color: colour of the verdict.
-        room: px to leave free at the right.
-    """
+    """Write texts side by side on a strip, and the first verdict that leaves `room` px free, in a colour."""
     x, baseline = HUD_MARGIN, image.shape[0] // 2 + 5
     for part in parts:
         write_text(image, part, (x, baseline), "white", 15, 500)

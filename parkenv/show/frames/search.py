@@ -37,15 +37,7 @@ TEXT_CELL_LEAST, TEXT_CELL = 1.25, 3.5
 
 
 class SearchRenderer:
-    """Renderer of the searches in one scenario.
-
-    Args:
-        scenario: the scenario.
-
-    Attributes:
-        frames: pictures of the lot.
-        window: shows frames on the screen.
-    """
+    """Renderer of the searches in one scenario."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -58,10 +50,6 @@ class SearchRenderer:
 
         A slot's colour shows the belief, pale until the slot has been observed. Parked cars show the true occupancy,
         so frames are for spectators, not for agents.
-
-        Args:
-            state: state of an environment with the renderer's scenario.
-            occupied: (n_slots,) bool, the cars to show; None for the true occupancy.
         """
         lot, belief = self.scenario.lot, state.belief
         if occupied is None:
@@ -82,11 +70,7 @@ class SearchRenderer:
     def _line(self, state: SearchState) -> Image:
         """Return the line of text below the map."""
         image = self._key.copy()
-        parts = (
-            clock(state.time),
-            f"{state.total_s:.0f} s",
-            f"{state.failed_parks} failed",
-        )
+        parts = (clock(state.time), f"{state.total_s:.0f} s", f"{state.failed_parks} failed")
         if state.parked:
             place = f"parked in {self.scenario.lot.slot_ids[state.vertex]}"
             verdicts = (

@@ -12,11 +12,7 @@ from parkenv.errors import needs_extra
 
 
 class Window:
-    """A window that opens with the first frame.
-
-    Args:
-        title: title of the window.
-    """
+    """A window that opens with the first frame."""
 
     def __init__(self, title: str) -> None:
         self._title = title

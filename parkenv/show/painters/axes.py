@@ -13,19 +13,13 @@ from matplotlib.path import Path as Outline
 from matplotlib.patheffects import Normal, Stroke
 
 from parkenv.show.colors import PALETTE
-from parkenv.show.scene import HALO_PX, Areas, Layer, Lines, Marks, Paint, Rings, placed_shape
+from parkenv.show.scene import HALO_PX, Areas, Layer, Lines, Paint, Rings, placed_shape
 
 _STEP = 0.01
 
 
 def paint(ax: Axes, layers: Sequence[Layer], zorder: float) -> None:
-    """Add layers to axes with an equal aspect and their final limits and size, on which widths depend.
-
-    Args:
-        ax: the axes.
-        layers: from the lowest to the highest.
-        zorder: of the lowest; the others follow in steps of 0.01.
-    """
+    """Add layers to axes with an equal aspect and their final limits and size, on which widths depend."""
     scale = points_per_m(ax)
     for i, layer in enumerate(layers):
         style: dict[str, Any] = {"zorder": zorder + _STEP * i, "alpha": layer.opacity}
@@ -45,20 +39,10 @@ def paint(ax: Axes, layers: Sequence[Layer], zorder: float) -> None:
                 style["path_effects"] = [halo, Normal()]
             ax.add_collection(LineCollection(list(layer.lines), joinstyle="round", **style))
         else:
-            ax.add_collection(_marks(layer, scale, style))
-
-
-def _marks(layer: Marks, scale: float, style: dict[str, Any]) -> PolyCollection:
-    least = layer.px / scale
-    size = np.broadcast_to(np.asarray(layer.size, dtype=np.float64), (len(layer.poses), 2))
-    # Shapes without a size of their own are as wide as long.
-    size = np.where(size[:, :1] > 0.0, size * np.maximum(1.0, least / np.maximum(size[:, :1], 1e-9)), least)
-    corners = placed_shape(layer.shape, layer.poses, size)
-    edge = "none" if layer.edge is None else _paint(layer.edge)
-    width = layer.edge_px if layer.edge is not None else 0.0
-    return PolyCollection(
-        list(corners), facecolors=_paint(layer.color), edgecolors=edge, linewidths=width, **style
-    )
+            corners = placed_shape(layer.shape, layer.poses, layer.sizes(1.0, layer.px / scale))
+            edge, width = ("none", 0.0) if layer.edge is None else (_paint(layer.edge), layer.edge_px)
+            style |= {"facecolors": _paint(layer.color), "edgecolors": edge, "linewidths": width}
+            ax.add_collection(PolyCollection(list(corners), **style))
 
 
 def _outline(polygon: Rings) -> Outline:
@@ -78,7 +62,7 @@ def _paint(color: Paint) -> Any:
         return _paint(PALETTE[color]) if color in PALETTE else color
     if isinstance(color, tuple) and all(isinstance(part, int) for part in color):
         return tuple(float(part) / 255.0 for part in color)
-    return [_paint(one) if isinstance(one, str | tuple) else one for one in color]
+    return [_paint(each) if isinstance(each, str | tuple) else each for each in color]
 
 
 def points_per_m(ax: Axes) -> float:
@@ -93,17 +77,8 @@ def draw_scale_bar(ax: Axes, x: float, y: float, width: float, ink: str) -> None
     power = 10.0 ** np.floor(np.log10(width / 6))
     length = power * max(step for step in (1, 2, 5) if step * power <= width / 6)
     thickness = 0.005 * width
-    for i in (0, 1):
-        left = x + i * length / 2
-        face = (ink, "white")[i]
-        ax.add_patch(
-            Rectangle((left, y), length / 2, thickness, facecolor=face, edgecolor=ink, linewidth=0.7)
-        )
-    ax.annotate(
-        f"{length:g} m",
-        (x + length, y + thickness / 2),
-        (5, 0),
-        textcoords="offset points",
-        va="center",
-        color=ink,
-    )
+    for left, face in ((x, ink), (x + length / 2, "white")):
+        half = Rectangle((left, y), length / 2, thickness, facecolor=face, edgecolor=ink, linewidth=0.7)
+        ax.add_patch(half)
+    end = x + length, y + thickness / 2
+    ax.annotate(f"{length:g} m", end, (5, 0), textcoords="offset points", va="center", color=ink)

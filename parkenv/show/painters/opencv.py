@@ -63,29 +63,23 @@ class MapView:
         angle: FloatArray = np.arctan2(ahead[..., 1], ahead[..., 0])
         return angle
 
-    def finer(self) -> MapView:
-        """Return the view of an image with `SUPERSAMPLING` times the resolution, to be averaged down."""
-        return MapView(self.turn, self.scale * SUPERSAMPLING, self.shift * SUPERSAMPLING, SUPERSAMPLING)
+    def finer(self, times: int = SUPERSAMPLING) -> MapView:
+        """Return the view of an image with so many times the resolution, to be averaged down."""
+        return MapView(self.turn, times * self.scale, times * self.shift, times)
 
 
 def paint(image: Image, view: MapView, layers: Sequence[Layer]) -> None:
     """Paint layers in order on an image, (h, w, 3) uint8 RGB."""
     for layer in layers:
-        if layer.opacity < 1.0:
-            below = image.copy()
-            _paint(image, view, layer)
-            cv2.addWeighted(image, layer.opacity, below, 1.0 - layer.opacity, 0.0, image)
+        below = image.copy() if layer.opacity < 1.0 else None
+        if isinstance(layer, Areas):
+            _paint_areas(image, view, layer)
+        elif isinstance(layer, Lines):
+            _paint_lines(image, view, layer)
         else:
-            _paint(image, view, layer)
-
-
-def _paint(image: Image, view: MapView, layer: Layer) -> None:
-    if isinstance(layer, Areas):
-        _paint_areas(image, view, layer)
-    elif isinstance(layer, Lines):
-        _paint_lines(image, view, layer)
-    else:
-        _paint_marks(image, view, layer)
+            _paint_marks(image, view, layer)
+        if below is not None:
+            cv2.addWeighted(image, layer.opacity, below, 1.0 - layer.opacity, 0.0, image)
 
 
 def _paint_areas(image: Image, view: MapView, layer: Areas) -> None:
@@ -94,7 +88,7 @@ def _paint_areas(image: Image, view: MapView, layer: Areas) -> None:
         cv2.fillPoly(image, pixels, color, _line_type(view), SUBPIXEL_BITS)
         if layer.edge is not None:
             thickness = max(1, round(layer.edge_px * view.density))
-            cv2.polylines(image, pixels, True, _only(layer.edge), thickness, _line_type(view), SUBPIXEL_BITS)
+            cv2.polylines(image, pixels, True, rgb(layer.edge), thickness, _line_type(view), SUBPIXEL_BITS)
 
 
 def _paint_lines(image: Image, view: MapView, layer: Lines) -> None:
@@ -119,7 +113,7 @@ def _paint_lines(image: Image, view: MapView, layer: Lines) -> None:
         pixels = (all_pixels[first:last] for first, last in pairwise(ends))
         parts = [[*fixed_point(_dashes(line, on, off))] for line in pixels]
     if _is_one(layer.color):
-        stroke([piece for pieces in parts for piece in pieces], _only(layer.color), width)
+        stroke([piece for pieces in parts for piece in pieces], rgb(layer.color), width)
         return
     for pieces, color in zip(parts, _colors(layer.color, len(parts)), strict=True):
         stroke(pieces, color, width)
@@ -138,34 +132,23 @@ def _paint_marks(image: Image, view: MapView, layer: Marks) -> None:
     if not len(layer.poses):
         return
     at = np.column_stack([view(layer.poses[:, :2]), view.yaw(layer.poses[:, 2])])
-    size = view.scale * np.broadcast_to(np.asarray(layer.size, dtype=np.float64), (len(at), 2))
-    least = layer.px * view.density
-    # Shapes without a size of their own are as wide as long.
-    size = np.where(size[:, :1] > 0.0, size * np.maximum(1.0, least / np.maximum(size[:, :1], 1e-9)), least)
-    colors = _colors(layer.color, len(at))
+    size = layer.sizes(view.scale, layer.px * view.density)
+    fills = [(size, _colors(layer.color, len(at)))]
     if layer.edge is not None:
-        border = rgb(layer.edge)
-        for corners in fixed_point(placed_shape(layer.shape, at, size + 2.0 * layer.edge_px * view.density)):
-            cv2.fillPoly(image, [corners], border, _line_type(view), SUBPIXEL_BITS)
-    for corners, color in zip(fixed_point(placed_shape(layer.shape, at, size)), colors, strict=True):
-        cv2.fillPoly(image, [corners], color, _line_type(view), SUBPIXEL_BITS)
+        fills.insert(0, (size + 2.0 * layer.edge_px * view.density, [rgb(layer.edge)] * len(at)))
+    for shown, colors in fills:
+        for corners, color in zip(fixed_point(placed_shape(layer.shape, at, shown)), colors, strict=True):
+            cv2.fillPoly(image, [corners], color, _line_type(view), SUBPIXEL_BITS)
 
 
 def _colors(color: Paint, n: int) -> list[Color]:
     """Return the colour of each of n shapes."""
-    return [_only(color)] * n if _is_one(color) else [_only(one) for one in color]
+    return [rgb(color)] * n if _is_one(color) else [rgb(each) for each in color]
 
 
 def _is_one(color: Paint) -> bool:
     """Whether all shapes have one colour."""
     return isinstance(color, str) or (isinstance(color, tuple) and isinstance(color[0], int))
-
-
-def _only(color: object) -> Color:
-    if isinstance(color, str):
-        return rgb(color)
-    red, green, blue = (int(part) for part in color)  # type: ignore[attr-defined]
-    return red, green, blue
 
 
 def _line_type(view: MapView) -> int:

@@ -33,14 +33,7 @@ Recording = dict[str, Any]
 def record_drive(
     survey: Survey, number: int, pictures: int = 0, most_frames: int = MOST_FRAMES
 ) -> tuple[SessionResult, Recording]:
-    """Drive a session of a survey, and record it.
-
-    Args:
-        survey: the survey.
-        number: number of the session.
-        pictures: number of perception results to keep for figures.
-        most_frames: maximum number of captures to record, evenly spaced, the last one included.
-    """
+    """Drive a session of a survey, and record it."""
     captures = len(poses_along(survey.route.path, survey.settings.every))
     step = max(1, math.ceil(captures / most_frames))
     frames: list[Recording] = []

@@ -49,19 +49,12 @@ _WHITE = 0.5
 
 
 class Page(NamedTuple):
-    """What a study says about a run.
-
-    Attributes:
-        title: heading of the page.
-        findings: the main result, and what to mind, a line each.
-        tables: from `tables.table_of`.
-        learning: from `learning.learning_panels`.
-    """
+    """What a study says about a run."""
 
     title: str
-    findings: Sequence[str] = ()
-    tables: Sequence[Mapping[str, Any]] = ()
-    learning: Sequence[Mapping[str, Any]] = ()
+    findings: Sequence[str] = ()  # a line each
+    tables: Sequence[Mapping[str, Any]] = ()  # from `tables.table_of`
+    learning: Sequence[Mapping[str, Any]] = ()  # see `TrainingSpec.page`
 
 
 def page_data(
@@ -183,6 +176,28 @@ def _webp(picture: PillowImage.Image, *, chart: bool) -> str:
         content = io.BytesIO()
         picture.save(content, "WEBP", quality=_QUALITY)
     return data_uri("image/webp", content.getvalue())
+
+
+def learning_panels(summary: Row, seeds: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
+    """Return the panel of learning curves, of rows of each seed's `curve.csv`; none without curves.
+
+    A point of the mean is decisions, mean, and the ends of its 95 % interval (None for one seed). Other trainings show
+    their median, which is robust against single searches that drive in circles.
+    """
+    curve, lines = summary.get("curve"), summary.get("evaluated")
+    if not curve or not isinstance(lines, Mapping):
+        return []
+
+    def points(rows: Sequence[Row], *names: str) -> list[list[Any]]:
+        return [[row["steps"], *map(row.get, names)] for row in rows]
+
+    return [{
+        "title": "total time, s",
+        "mean": points(curve, "total_s", "low_s", "high_s"),
+        "seeds": [points([r for r in rows if {"steps", "total_s"} <= r.keys()], "total_s") for rows in seeds],
+        "beside": [[name, points(rows, "median_s")] for name, rows in summary.get("beside", {}).items()],
+        "lines": [[name, value] for name, value in lines.items()],
+    }]  # fmt: skip
 
 
 def on_scenarios(rows: Sequence[Row], most: int = 4) -> str:

@@ -40,9 +40,9 @@ def result_files(path: Path) -> list[Path]:
     """Return the result files in a folder: each `result.json` below it, or else each `.json`; a file is itself."""
     if not path.is_dir():
         return [path]
-    if not (found := sorted(path.rglob(RESULT)) or sorted(path.rglob("*.json"))):
+    if not (files := sorted(path.rglob(RESULT)) or sorted(path.rglob("*.json"))):
         raise InputError(f"{path}: no {RESULT} below it")
-    return found
+    return files
 
 
 class Entry(NamedTuple):
@@ -121,31 +121,14 @@ def neighbours(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
 
 
 def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, Any]:
-    """Build the data of a page, the best score first.
-
-    Args:
-        results: contents of result files that passed `check_result`.
-        command: the command that makes the page.
-    """
+    """Build the data of a page, the best score first."""
     suite, entries = Suite.packaged(), entries_of(results)
-    pairs, searches = neighbours(suite, entries), sum(map(len, entries[0].times.values()))
-    findings = [
-        suite.description,
-        f"{len(suite.tasks)} tasks, {searches:,} searches of each agent, the same worlds for all. The score is the "
-        "mean time of the clairvoyant lower bound over the agent's, averaged over the tasks.",
-    ]
-    if pairs:
-        errors = [row["error"] for row in pairs]
-        findings.append(
-            f"Neighbours among the first {len(pairs) + 1} are significantly different if their mean times differ by "
-            f"{_WIDE * min(errors):.1f} to {_WIDE * max(errors):.1f} s."
-        )
     times = [
         {"agent": entry.agent}
         | {f"{row['task']}{end}": row[f"total_s{end}"] for row in entry.rows for end in ("", "_ci95")}
         for entry in entries
     ]
-    made = [
+    origins = [
         {"agent": ", ".join(result["episodes"]), "command": shlex.join(result["command"])} | _origin(result)
         for result in results
     ]
@@ -153,14 +136,14 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
     tables = [
         table_of("scores", "Ranking", ranking(suite, entries), _COLUMNS),
         table_of("times", "Mean total time in each task", times, in_tasks),
-        table_of("pairs", "How many searches tell neighbours apart", pairs, _COLUMNS),
-        table_of("commands", "How the results were made", made, _COLUMNS),
+        table_of("pairs", "How many searches tell neighbours apart", neighbours(suite, entries), _COLUMNS),
+        table_of("commands", "How the results were made", origins, _COLUMNS),
         table_of(
             "tasks", "Every task", [row for result in results for row in result["rows"]], Benchmark.columns
         ),
     ]
     summary = {"command": command, "version": __version__, "seed": None}
-    return page_data("benchmark", Page(f"Benchmark suite {suite.name}", findings, tables), summary)
+    return page_data("benchmark", Page(f"Benchmark suite {suite.name}", [suite.description], tables), summary)
 
 
 _TIMES = "Mean total time, 95 % interval"

@@ -233,6 +233,6 @@ class Commute(Study):
         ]
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        from parkenv.show.figures.commute import save_commute_curves
+        from parkenv.show.figures.times import save_commute_curves
 
         return [partial(save_commute_curves, result.rows, result.folder / PICTURE)]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from parkenv.engine.search_record import SearchRecord
 from parkenv.errors import InputError
-from parkenv.show.search_record import SearchRecord
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, settings_of
 from parkenv.studies.compare.comparison import Grid
@@ -21,12 +21,6 @@ def plan_searches(
     scenario: Scenario, agent: AgentSpec, grid: Grid, seed: int
 ) -> tuple[list[Row], Sequence[SearchRecord]]:
     """Plan and run one search in each setting.
-
-    Args:
-        scenario: the scenario.
-        agent: one that makes a plan: mdp or mdp-static.
-        grid: costs and speeds.
-        seed: seed of the world.
 
     Returns:
         A row for each setting, with expected and total time, s, and the path; and the searches, for pictures.

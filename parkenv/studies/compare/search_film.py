@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, Image
+from parkenv.engine.search_record import Moment, SearchRecord
 from parkenv.show.colors import PALETTE, belief_colors, rgb
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.figures.survey import draw_detections
 from parkenv.show.frames.lot import PIXELS, LotFrames, clock, draw_belief_key, paint_goal, strip
 from parkenv.show.frames.search import car_pose, searching_car, view_range, walk
 from parkenv.show.painters.opencv import paint, write_text
-from parkenv.show.scene import DISC, Lines, Marks, cars, posed
-from parkenv.show.search_record import Moment, SearchRecord
+from parkenv.show.scene import DISC, Layer, Lines, Marks, cars, posed
 from parkenv.studies.compare.cases import Case
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 from parkenv.world.lot import PARK
@@ -43,14 +43,7 @@ _CAMERA = (213, 160)
 
 
 class SearchFilm:
-    """Film of a search in `parkenv/SearchPerception-v2`.
-
-    Args:
-        record: the search, with its moments.
-
-    Attributes:
-        frames: the frames, (h, w, 3) uint8.
-    """
+    """Film of a search in `parkenv/SearchPerception-v2`."""
 
     def __init__(self, record: SearchRecord) -> None:
         self._record, self._scenario = record, record.scenario
@@ -62,8 +55,8 @@ class SearchFilm:
         self._camera = np.full((_CAMERA[1], _CAMERA[0], 3), PALETTE["ground"], np.uint8)
         self._parts = dict.fromkeys(COST_FIELDS, 0.0)
         self._moment, self._path = record.moments[0], [record.moments[0].vertex]
-        self._slots = self._slots_image()
         self._pose, self._trail = car_pose(self._scenario, self._path, parked=False), list[FloatArray]()
+        self._look(camera=False)
         self._take("A car arrives. Its map says how likely each slot is taken.", hold=INTRO_S)
         for moment in record.moments[1:]:
             self._step(moment)
@@ -78,7 +71,7 @@ class SearchFilm:
         start, end = self._pose, car_pose(self._scenario, self._path, parked=self._parked)
         self._parts |= {key: float(moment.info[key]) for key in self._parts if key != "walk_s"}
         if moment.action == PARK and not self._parked:
-            self._slots = self._slots_image()
+            self._look(camera=False)
             self._take(
                 f"Slot {lot.slot_ids[moment.vertex]} is taken after all: a failed attempt", hold=FAILED_S
             )
@@ -110,7 +103,7 @@ class SearchFilm:
             self._take(f"No free slot found: {metrics['total_s']:.0f} s", hold=LAST_S)
             return
         slot, goal = lot.slot_xy[self._moment.vertex], lot.goals[self._scenario.goal]
-        self._slots = self._slots_image()
+        self._look()
         text = f"The driver walks {metrics['walked_m']:.0f} m to the goal"
         self._take(text, hold=PARKED_S)
         count = max(2, round(float(metrics["walk_s"]) * FPS / WALK_SPEEDUP))
@@ -131,13 +124,19 @@ class SearchFilm:
         """Whether the car is in its slot."""
         return bool(self._moment.info.get("parked"))
 
-    def _slots_image(self) -> Image:
-        moment = self._moment
-        occupied = self._record.world.occupied(np.arange(self._scenario.lot.n_slots), moment.time)
+    def _look(self, *, camera: bool = True) -> None:
+        """Update the colours of the slots and the picture of the camera."""
+        moment, slots = self._moment, np.arange(self._scenario.lot.n_slots)
+        occupied = self._record.world.occupied(slots, moment.time)
         if self._parked:
             occupied[moment.vertex] = False  # the searching car itself is there
+        elif camera and moment.captures:
+            view = moment.captures[-1].views[0]
+            drawn = draw_detections(view.image, view.detections, view.cars.detection)
+            self._camera = cv2.resize(drawn, _CAMERA, interpolation=cv2.INTER_AREA)
         belief = moment.belief
-        return self._map.slots(self._here, belief_colors(belief.p_occupied, belief.observed), occupied)
+        colors = belief_colors(belief.p_occupied, belief.observed)
+        self._slots = self._map.slots(self._here, colors, occupied)
 
     @property
     def _here(self) -> FloatArray:
@@ -149,41 +148,30 @@ class SearchFilm:
         """Return the map with the plan, the trail, the goal, the car and the walking driver."""
         scenario, here = self._scenario, self._here
         image, view, goal = self._slots.copy(), self._map.still(here).view, scenario.lot.goals[scenario.goal]
+        layers: list[Layer] = []
         if len(plan) > 1:
-            line = np.array(plan)
-            paint(
-                image,
-                view,
-                [Lines([line], "ink", px=(2.0, 2.0)), Marks(posed(line[-1]), DISC, "ink", px=10.0)],
-            )
+            layers += [
+                Lines([np.array(plan)], "ink", px=(2.0, 2.0)),
+                Marks(posed(plan[-1]), DISC, "ink", px=10.0),
+            ]
         trail = np.array([*self._trail, self._pose[:2]])
-        paint(image, view, [Lines([trail], "car", px=(3.0, 3.0), halo="ink")])
+        layers.append(Lines([trail], "car", px=(3.0, 3.0), halo="ink"))
         if self._parked:
-            paint(image, view, [walk(scenario.lot.slot_xy[self._moment.vertex], goal)])
+            layers.append(walk(scenario.lot.slot_xy[self._moment.vertex], goal))
+        paint(image, view, layers)
         paint_goal(image, view, goal, here)
-        if not self._parked:
-            paint(image, view, [view_range(scenario, self._pose)])
-        paint(image, view, searching_car(self._pose))
-        if walker is not None:
-            paint(image, view, [Marks(posed(walker), DISC, "goal", px=12.0, edge="white", edge_px=2.0)])
+        around = [] if self._parked else [view_range(scenario, self._pose)]
+        walker_at = (
+            [] if walker is None else [Marks(posed(walker), DISC, "goal", px=12.0, edge="white", edge_px=2.0)]
+        )
+        paint(image, view, [*around, *searching_car(self._pose), *walker_at])
         return image
 
     def _seen_so_far(self) -> str:
         belief = self._moment.belief
-        taken = int((belief.p_occupied[belief.observed] > 0.5).sum())
-        free = int(belief.observed.sum()) - taken
-        return (
-            f"Its camera and laser saw {taken} taken and {free} free slots" if taken + free else "It searches"
-        )
-
-    def _look(self) -> None:
-        """Update the picture of the camera and the colours of the slots."""
-        self._slots = self._slots_image()
-        captures = self._moment.captures
-        if captures and not self._parked:
-            view = captures[-1].views[0]
-            drawn = draw_detections(view.image, view.detections, view.cars.detection)
-            self._camera = cv2.resize(drawn, _CAMERA, interpolation=cv2.INTER_AREA)
+        seen = belief.p_occupied[belief.observed] > 0.5
+        saw = f"Its camera and laser saw {seen.sum()} taken and {(~seen).sum()} free slots"
+        return saw if len(seen) else "It searches"
 
     def _take(
         self,
@@ -213,43 +201,40 @@ class SearchFilm:
         left = width + 28
         x = write_text(panel, f"agent {self._record.agent}:", (left, 28), "ink", 16, 700) + 12
         for term in COST_TERMS:
-            if term.optional and not parts[term.field]:
-                continue
-            cv2.rectangle(panel, (x, 15), (x + 13, 28), rgb(term.color), cv2.FILLED)
-            x = (
-                write_text(panel, f"{term.label} {parts[term.field]:.0f} s", (x + 20, 28), "ink", 16, 500)
-                + 20
-            )
-        self._legend(panel, left)
+            if parts[term.field] or not term.optional:
+                cv2.rectangle(panel, (x, 15), (x + 13, 28), rgb(term.color), cv2.FILLED)
+                words = f"{term.label} {parts[term.field]:.0f} s"
+                x = 20 + write_text(panel, words, (x + 20, 28), "ink", 16, 500)
+        _draw_legend(panel, left)
         return panel
 
-    def _legend(self, panel: Image, left: int) -> None:
-        def words(text: str, x: int, y: int) -> None:
-            write_text(panel, text, (x, y), SOFT, 15, 500)
 
-        right, size = left + 300, (26.0, 12.0)
-        dots = posed(np.array([left + 22.0, 88.0]))
-        circle = np.array([left + 412.0, 118.0]) + 18.0 * np.vstack([DISC, DISC[:1]])
-        layers = [
-            *cars(posed(np.array([left + 13.0, 58.0])), "car", size, edge="ink"),
-            *cars(posed(np.array([right + 13.0, 58.0])), "parked", size, glass="glass"),
-            Lines([np.array([[left, 88.0], [left + 22.0, 88.0]])], "ink", px=(2.0, 2.0)),
-            Marks(dots, DISC, "ink", px=10.0),
-            walk(np.array([right, 88.0]), np.array([right + 28.0, 88.0])),
-            Lines([circle], "glass", px=(2.0, 2.0)),
-        ]
-        paint(panel, PIXELS, layers)
-        words("the searching car", left + 38, 63)
-        words("a parked car, hidden until seen", right + 38, 63)
-        words("its plan", left + 38, 93)
-        words("the walk to the goal G", right + 38, 93)
-        words("sensor range", left + 430, 123)
-        for half, (text, y) in enumerate((("what the map says", 123), ("what the car has seen", 151))):
-            scale = np.zeros((24, 90, 3), np.uint8)
-            draw_belief_key(scale, (0, 0), (90, 24))
-            words("free", left, y)
-            panel[y - 11 : y + 1, left + 40 : left + 130] = scale[12 * half : 12 * half + 12]
-            words(f"taken: {text}", left + 140, y)
+def _draw_legend(panel: Image, left: int) -> None:
+    right, size = left + 300, (26.0, 12.0)
+    circle = np.array([left + 412.0, 118.0]) + 18.0 * np.vstack([DISC, DISC[:1]])
+    layers = [
+        *cars(posed(np.array([left + 13.0, 58.0])), "car", size, edge="ink"),
+        *cars(posed(np.array([right + 13.0, 58.0])), "parked", size, glass="glass"),
+        Lines([np.array([[left, 88.0], [left + 22.0, 88.0]])], "ink", px=(2.0, 2.0)),
+        Marks(posed(np.array([left + 22.0, 88.0])), DISC, "ink", px=10.0),
+        walk(np.array([right, 88.0]), np.array([right + 28.0, 88.0])),
+        Lines([circle], "glass", px=(2.0, 2.0)),
+    ]
+    paint(panel, PIXELS, layers)
+    scale = np.zeros((24, 90, 3), np.uint8)
+    draw_belief_key(scale, (0, 0), (90, 24))
+    words = [
+        ("the searching car", left + 38, 63),
+        ("a parked car, hidden until seen", right + 38, 63),
+        ("its plan", left + 38, 93),
+        ("the walk to the goal G", right + 38, 93),
+        ("sensor range", left + 430, 123),
+    ]
+    for half, (text, y) in enumerate((("what the map says", 123), ("what the car has seen", 151))):
+        words += [("free", left, y), (f"taken: {text}", left + 140, y)]
+        panel[y - 11 : y + 1, left + 40 : left + 130] = scale[12 * half : 12 * half + 12]
+    for text, x, y in words:
+        write_text(panel, text, (x, y), SOFT, 15, 500)
 
 
 def film_search(case: Case, seed: int, path: Path) -> None:

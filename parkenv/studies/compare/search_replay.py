@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.engine.search_record import SearchRecord
 from parkenv.show.scene import LotScene
-from parkenv.show.search_record import SearchRecord
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.report import AGREES_S, MOST_SLOTS, Recording, ReplayJob
 from parkenv.studies.report_options import ReportOptions
@@ -28,14 +28,9 @@ SEARCHES, SENSED = 20, 4
 
 
 class Encounter(NamedTuple):
-    """Several agents in the same world.
+    """Several agents in the same world."""
 
-    Attributes:
-        cases: one case per agent, all in one setting.
-        seed: seed of the world.
-    """
-
-    cases: tuple[Case, ...]
+    cases: tuple[Case, ...]  # one per agent, all in one setting
     seed: int
 
 
@@ -94,38 +89,31 @@ def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[E
 
 
 def replay(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Recording:
-    """Repeat the searches of all agents of an encounter, and record them.
-
-    Args:
-        encounter: the agents and their world.
-        counted: total time, s, of each search in the original run, by `Case.key`; the totals of missing searches are
-            not checked.
-    """
-    records = [case.runner().run(encounter.seed, moments=True) for case in encounter.cases]
-    one_case, last = encounter.cases[0], records[-1]
-    scenario, start = one_case.scenario, last.arrival.time
+    """Repeat the searches of all agents of an encounter, and record them beside the totals of `episodes.csv`."""
+    first, scenario = encounter.cases[0], encounter.cases[0].scenario
     searches, moments = [], {0.0}
-    for case, record in zip(encounter.cases, records, strict=True):
+    for case in encounter.cases:
+        record = case.runner().run(encounter.seed, moments=True)
         search = recorded(record)
         before = counted.get(case.key(encounter.seed))
         search["counted_s"] = before
         search["agrees"] = None if before is None else abs(before - search["total_s"]) <= AGREES_S
         searches.append(search)
         moments |= {centiseconds / 100.0 for centiseconds in search["t"]}
-    longest = max(moments)
-    moments |= set(np.arange(0.0, min(longest, STEADY_S), 1.0).tolist())
+    start = record.arrival.time
+    moments |= set(np.arange(0.0, min(max(moments), STEADY_S), 1.0).tolist())
     world = {
         "scenario": scenario.name,
-        "setting": {k: v for k, v in one_case.columns.items() if k != "agent"},
+        "setting": {k: v for k, v in first.columns.items() if k != "agent"},
         "seed": encounter.seed,
-        "day": last.arrival.day,
+        "day": record.arrival.day,
         "arrival_s": round(start, 3),
         "goal": scenario.goal,
         "view_range_m": round(float(scenario.sensor_model.view_range), 2),
         "v_walk": round(float(scenario.v_walk), 4),
-        "sensors": one_case.rig,
-        "forecast": _bytes(last.forecast),
-        **_truth(last.world, scenario.lot.n_slots, start, sorted(moments)),
+        "sensors": first.rig,
+        "forecast": _bytes(record.forecast),
+        **_truth(record.world, scenario.lot.n_slots, start, sorted(moments)),
         "searches": searches,
     }
     differences = [

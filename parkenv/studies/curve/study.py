@@ -197,7 +197,7 @@ class CurveStudy(FleetSpec):
 
     def outputs(self, result: Result) -> list[Task[object]]:
         from parkenv.files.file_names import file_name
-        from parkenv.show.figures.curve import save_curves
+        from parkenv.show.figures.fleet import save_curves
         from parkenv.show.plurals import plural
         from parkenv.studies.curve.curves import load_curves
         from parkenv.studies.curve.fit import PREDICTORS, fitted_forms

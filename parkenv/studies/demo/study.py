@@ -247,16 +247,12 @@ def _small_scenario() -> Scenario:
 
 
 def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:
-    """Draw the map at the middle of the arrival window, and the true probabilities."""
-    from parkenv.mapping.inference import predict
-    from parkenv.show.figures.survey import save_map
+    """Draw the map at the middle of the arrival window."""
     from parkenv.show.plurals import plural
-    from parkenv.studies.sensing.surveys import mean_occupancy
+    from parkenv.studies.sensing.surveys import draw_map
     from parkenv.world.occupancy.arrival_window import DAY_NAMES
-    from parkenv.world.week import DAY_S
 
     shown = replace(scenario.arrival, weekdays=scenario.arrival.weekdays[:2][-1:])
-    time = DAY_S * shown.weekdays[0] + 0.5 * (shown.start_s + shown.end_s)
-    hour, minute = divmod(int(time % DAY_S // 60), 60)
-    title = f"{scenario.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {plural(sessions, 'session')}"
-    save_map(scenario.lot, predict(log, time), mean_occupancy(scenario.occupancy, shown), title, path)
+    hour, minute = divmod(int(0.5 * (shown.start_s + shown.end_s) // 60), 60)
+    time = f"{DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}"
+    draw_map(scenario, log, shown, f"{scenario.name}, {time}, {plural(sessions, 'session')}", path)

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.engine.records import STATES
 from parkenv.show.report.page import page_data, write_page
-from parkenv.show.report.town_map import town_data
+from parkenv.show.scene import SQUARE, Lines, building_layers, layer_data, rounded
 from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, TABLES, Blocks, by_hour
 from parkenv.studies.fleet.day import ALL
 from parkenv.studies.fleet.setting import Setting
 from parkenv.studies.report import Recording, ReplayJob
 from parkenv.studies.results import Row, without_nan
+from parkenv.world.lot import ParkingLot, is_building
 from parkenv.world.scenario import Scenario
 from parkenv.world.tariff import PUBLIC, Zone
 from parkenv.world.week import HOUR_S
@@ -27,6 +30,11 @@ if TYPE_CHECKING:
 
 MAP_PAGE = "fleet.html"
 MOST_MAPS = 6
+LANE_WIDTH = 5.5
+GAP = 1.2
+"""m between slots of a block up to which they are drawn as one area."""
+COUNTED_AREA, LEAST_SIDE = 6.0, 12.0
+"""m2 of the square of a counted facility for each car that fits, and its least side, m."""
 MOST_NUMBERS = 1_500_000
 """Numbers of all maps of a page: with more, it would load slowly."""
 Rows = Mapping[str, Sequence[Row]]
@@ -49,35 +57,76 @@ def write_map_page(study: FleetStudy, summary: Row, rows: Rows, folder: Path) ->
 def map_recordings(study: FleetStudy, rows: Rows) -> list[Recording]:
     """Return `town` and `map` of a page of some settings, those to be shown first."""
     shown = study.shown_settings
-    chosen = [*shown, *(one for one in study.fleet_settings if one not in shown)][:MOST_MAPS]
-    towns = {name: _town(study.built[name]) for name in {setting.scenario for setting in chosen}}
-    made: list[Recording] = []
+    chosen = [*shown, *(setting for setting in study.fleet_settings if setting not in shown)][:MOST_MAPS]
+    scenarios = {setting.scenario: study.built[setting.scenario] for setting in chosen}
+    towns = {name: town_data(s.lot, [*map(rules_text, s.zone_rules)]) for name, s in scenarios.items()}
+    maps: list[Recording] = []
     for setting in chosen:
-        its = {file: [row for row in of_table if setting.holds(row)] for file, of_table in rows.items()}
-        if its[BLOCKS.file]:
-            made.append(
-                {"town": towns[setting.scenario], "map": _map(study.built[setting.scenario], setting, its)}
-            )
-    numbers = np.cumsum([len(one["town"]["blocks"]) * len(one["map"]["hours"]) * 6 for one in made])
-    return [one for one, so_far in zip(made, numbers, strict=True) if so_far <= max(MOST_NUMBERS, numbers[0])]
-
-
-def _town(scenario: Scenario) -> dict[str, Any]:
-    lot, blocks = scenario.lot, Blocks.of(scenario.lot)
-    rules = [rules_text(zone) for zone in scenario.zone_rules]
-    first = np.unique(blocks.of_slot, return_index=True)[1]
-    about = [
-        {"name": name, "type": kind, "zone": zone, "slots": slots, "rules": rules[number]}
-        for name, kind, zone, slots, number in zip(
-            blocks.names,
-            blocks.types,
-            blocks.zones,
-            blocks.slots.tolist(),
-            lot.zone_of_slot[first].tolist(),
-            strict=True,
-        )
+        of_setting = {file: [row for row in table if setting.holds(row)] for file, table in rows.items()}
+        if of_setting[BLOCKS.file]:
+            day = _map(scenarios[setting.scenario], setting, of_setting)
+            maps.append({"town": towns[setting.scenario], "map": day})
+    numbers = np.cumsum([len(each["town"]["blocks"]) * len(each["map"]["hours"]) * 6 for each in maps])
+    return [
+        each for each, so_far in zip(maps, numbers, strict=True) if so_far <= max(MOST_NUMBERS, numbers[0])
     ]
-    return town_data(lot, about, blocks.of_slot)
+
+
+def town_data(lot: ParkingLot, rules: Sequence[str]) -> dict[str, Any]:
+    """Return the `town` of a page, of a lot and the rules of its zones: lengths in m, rounded to decimetres."""
+    blocks = Blocks.of(lot)
+    first = np.unique(blocks.of_slot, return_index=True)[1]
+    columns = (
+        blocks.names,
+        blocks.types,
+        blocks.zones,
+        blocks.slots.tolist(),
+        lot.zone_of_slot[first].tolist(),
+    )
+    lanes = [lane.points for lane in lot.lanes]
+    ground = [
+        *building_layers(
+            [wall for wall in lot.walls if is_building(wall)],
+            [wall for wall in lot.walls if not is_building(wall)],
+        ),
+        Lines(lanes, "asphalt", LANE_WIDTH, (1.5, LANE_WIDTH)),
+    ]
+    return {
+        "name": lot.name,
+        "bounds": rounded(np.array(lot.bounds()), 1),
+        "ground": [layer_data(layer, 1) for layer in ground],
+        "lanes": [rounded(points, 1) for points in lanes],
+        "goals": [rounded(xy, 1) for xy in lot.goals],
+        "blocks": [
+            {"name": name, "type": kind, "zone": zone, "slots": slots, "rules": rules[number]}
+            | _place(lot, np.flatnonzero(blocks.of_slot == block))
+            for block, (name, kind, zone, slots, number) in enumerate(zip(*columns, strict=True))
+        ],
+    }
+
+
+def _place(lot: ParkingLot, slots: IntArray) -> dict[str, Any]:
+    """Return the areas of slots that are drawn as one block, and a place in it.
+
+    A counted facility is a square as large as its slots would be on a few storeys.
+    """
+    facility = lot.facilities[lot.facility_of_slot[slots[0]]] if lot.facility_of_slot[slots[0]] >= 0 else None
+    if facility is not None and facility.xy is not None and facility.is_counted:
+        side = max(math.sqrt(COUNTED_AREA * facility.capacity), LEAST_SIDE)
+        square = np.array(facility.xy) + side * SQUARE
+        return {"at": rounded(np.array(facility.xy), 1), "areas": [[rounded(square, 1)]]}
+    corners = shapely.polygons(lot.slot_corners()[slots])
+    joined = shapely.union_all(shapely.buffer(corners, GAP / 2, join_style="mitre"))
+    area = shapely.simplify(shapely.buffer(joined, 0.2 - GAP / 2, join_style="mitre"), 0.2)
+    xy = lot.slot_xy[slots]
+    middle = xy[np.argmin(np.hypot(*(xy - xy.mean(axis=0)).T))]
+    return {
+        "at": rounded(middle, 1),
+        "areas": [
+            [rounded(shapely.get_coordinates(ring)[:-1], 1) for ring in (part.exterior, *part.interiors)]
+            for part in shapely.get_parts(area)
+        ],
+    }
 
 
 def rules_text(zone: Zone) -> str:
@@ -88,28 +137,28 @@ def rules_text(zone: Zone) -> str:
         >>> rules_text(Zone("inner", Price(2.0, free_s=900.0), max_stay_s=7200.0))
         '2 an hour, 15 min free; up to 2 h'
     """
-    price, said = zone.price, []
+    price, parts = zone.price, []
     if price.steps:
         table = ", ".join(f"{amount:g} up to {_time_text(stay_s)}" for stay_s, amount in price.steps)
-        said.append(f"{table}{f', then {price.per_hour:g} an hour' if price.per_hour else ''}")
+        parts.append(f"{table}{f', then {price.per_hour:g} an hour' if price.per_hour else ''}")
     elif price.per_hour:
-        said.append(f"{price.per_hour:g} an hour")
+        parts.append(f"{price.per_hour:g} an hour")
     elif price.hourly:
         spans = (f"{amount:g} {hours.removeprefix('Mo-Su ')}" for amount, hours in price.rules)
-        said.append(f"an hour: {', '.join(spans)}")
-    if said:
-        said[0] += f", {_time_text(price.free_s)} free" if price.free_s else ""
-        said[0] += f", at most {price.daily_cap:g} a day" if price.daily_cap is not None else ""
-        said[0] += f", {price.charged}" if price.charged else ""
+        parts.append(f"an hour: {', '.join(spans)}")
+    if parts:
+        parts[0] += f", {_time_text(price.free_s)} free" if price.free_s else ""
+        parts[0] += f", at most {price.daily_cap:g} a day" if price.daily_cap is not None else ""
+        parts[0] += f", {price.charged}" if price.charged else ""
     if price.per_kwh:
-        said.append(f"{price.per_kwh:g} a kWh")
+        parts.append(f"{price.per_kwh:g} a kWh")
     if zone.max_stay_s is not None:
-        said.append(f"up to {_time_text(zone.max_stay_s)}")
+        parts.append(f"up to {_time_text(zone.max_stay_s)}")
     if zone.hours is not None:
-        said.append(f"open {zone.hours}")
+        parts.append(f"open {zone.hours}")
     if PUBLIC not in zone.users:
-        said.append(f"for {', '.join(zone.users)}")
-    return "; ".join(said)
+        parts.append(f"for {', '.join(zone.users)}")
+    return "; ".join(parts)
 
 
 def _time_text(seconds: float) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,6 @@ from parkenv.studies.fleet.setting import Setting, rate_text
 from parkenv.studies.report import AGREES_S, MOST_SLOTS, Recording, ReplayJob
 from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Key
-from parkenv.world.scenario import Scenario
 
 if TYPE_CHECKING:
     from parkenv.studies.fleet.study import FleetStudy
@@ -76,11 +76,10 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
     mean_s = float(cars["total_s"][cars["parked_at"] < 0].mean())
     before = counted.get(study.keys(setting, day)[0])
     agrees = None if before is None else abs(before - mean_s) <= AGREES_S
-    differences = []
-    if before is not None and not agrees:
-        differences.append(
-            f"{setting}, day {day}: run again the mean was {mean_s:.2f} s, days.csv says {before:.2f} s"
-        )
+    ran = f"{setting}, day {day}: run again the mean was {mean_s:.2f} s, days.csv says"
+    stay = np.flatnonzero(residents > begin)
+    parked = np.isin(cars["state"], (PARKED, LEFT))
+    left = _centiseconds(cars["ended_at"] + cars["stay_s"] - begin)
     return {
         "lot": LotScene.of(scenario.lot).data(),
         "fleet": {
@@ -90,15 +89,20 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
             "date": fleet.day.date,
             "begin_s": round(begin, 3),
             "goal": scenario.goal,
-            "duration": _centiseconds(float(cars["ended_at"].max()) - begin),
+            "duration": int(_centiseconds(cars["ended_at"].max() - begin)),
             "total_s": mean_s,
             "counted_s": before,
             "agrees": agrees,
-            "residents": _residents(residents, begin),
-            **_cars(cars, begin),
-            "tracks": _tracks(fleet, scenario),
+            # slot and time of departure of each car that is parked when the day begins
+            "residents": np.stack([stay, _centiseconds(residents[stay] - begin)], axis=1).ravel().tolist(),
+            "arrival": _centiseconds(cars["arrival"] - begin).tolist(),
+            "ended": _centiseconds(cars["ended_at"] - begin).tolist(),
+            "slot": np.where(parked, cars["slot"], NO_CAR).tolist(),
+            "leaves": np.where(parked & np.isfinite(cars["stay_s"]), left, -1).tolist(),
+            "member": (cars["kind"] == 0).astype(int).tolist(),
+            "tracks": _tracks(fleet),
         },
-        "differences": differences,
+        "differences": [f"{ran} {before:.2f} s"] if agrees is False else [],
     }
 
 
@@ -123,31 +127,12 @@ def choose_days(
     return [(settings[i], day) for i, day in sorted(chosen)]
 
 
-def _residents(leaves_at: FloatArray, begin: float) -> list[int]:
-    """Return [slot, time of departure, ...] of the cars that are parked when the day begins."""
-    slots = np.flatnonzero(leaves_at > begin)
-    return [number for slot in slots for number in (int(slot), _centiseconds(leaves_at[slot] - begin))]
-
-
-def _cars(cars: NDArray[np.void], begin: float) -> dict[str, list[int]]:
-    """Return lists over cars: arrival, end of the search, slot or -1, departure or -1, member or not."""
-    parked = np.isin(cars["state"], (PARKED, LEFT))
-    leaves = np.where(parked, cars["ended_at"] + cars["stay_s"], np.inf)
-    return {
-        "arrival": [_centiseconds(t - begin) for t in cars["arrival"]],
-        "ended": [_centiseconds(t - begin) for t in cars["ended_at"]],
-        "slot": [int(slot) for slot in np.where(parked, cars["slot"], NO_CAR)],
-        "leaves": [_centiseconds(t - begin) if np.isfinite(t) else -1 for t in leaves],
-        "member": [int(kind == 0) for kind in cars["kind"]],
-    }
-
-
-def _tracks(fleet: Fleet, scenario: Scenario) -> list[list[int]]:
+def _tracks(fleet: Fleet) -> list[list[int]]:
     """Return the track of each car: its entry; for each point the centiseconds to it, and 4 x vertex + what it does.
 
     The position is linear in between.
     """
-    xy, cars, begin = scenario.lot.vertex_xy, fleet.cars, fleet.begin
+    xy, cars, begin = fleet.scenario.lot.vertex_xy, fleet.cars, fleet.begin
     steps = fleet.steps
     steps = steps[np.argsort(steps["car"], kind="stable")]
     first = np.searchsorted(steps["car"], np.arange(len(cars) + 1))
@@ -168,19 +153,17 @@ def _track(
         time, vertex = end, target
     if ended > time:
         points.append((ended, vertex, QUEUE))
-    track, before = [entry], _centiseconds(arrival - begin)
-    for when, vertex, kind in _without_straight(points, xy, arrival, entry):
-        now = _centiseconds(when - begin)
-        track += [now - before, 4 * vertex + kind]
-        before = now
-    return track
+    points = _without_straight(points, xy, arrival, entry)
+    elapsed = np.diff(_centiseconds(np.array([arrival, *(when for when, _, _ in points)]) - begin)).tolist()
+    codes = [4 * vertex + kind for _, vertex, kind in points]
+    return [entry, *chain.from_iterable(zip(elapsed, codes, strict=True))]
 
 
 def _without_straight(
     points: Sequence[tuple[float, int, int]], xy: FloatArray, time: float, vertex: int
 ) -> list[tuple[float, int, int]]:
     """Leave out points at which a car drives straight on at the same speed."""
-    kept: list[tuple[float, int, int]] = []
+    bends: list[tuple[float, int, int]] = []
     x0, y0 = xy[vertex]
     speed: tuple[float, float] | None = None  # of the straight line under way, m/s
     start = time
@@ -194,10 +177,12 @@ def _without_straight(
             off = max(abs(x0 + speed[0] * elapsed - ahead[0]), abs(y0 + speed[1] * elapsed - ahead[1]))
             if off <= STRAIGHT_M:
                 continue
-        kept.append((when, at, kind))
+        bends.append((when, at, kind))
         x0, y0, start, speed = x, y, when, None
-    return kept
+    return bends
 
 
-def _centiseconds(seconds: float) -> int:
-    return round(100 * float(seconds))
+def _centiseconds(seconds: Any) -> NDArray[np.int64]:
+    """Return times in whole centiseconds; those of what never happens are 0."""
+    rounded: NDArray[np.int64] = np.round(100 * np.where(np.isfinite(seconds), seconds, 0.0)).astype(np.int64)
+    return rounded

@@ -281,7 +281,7 @@ class DemandStudy(Study):
         return HeldOutErrors(days, shares, fit_error, come, stay_h)
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        from parkenv.show.figures.forecast import CarParkDays, save_counted_demand
+        from parkenv.show.figures.fleet import CarParkDays, save_counted_demand
 
         town, held_out, fits = self.town, self._held_out(result.results), result.results.rows(FITTED)
         last = self.roll_outs - 1

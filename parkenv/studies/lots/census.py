@@ -62,8 +62,7 @@ def take_census(
     Returns a row for each lot, the largest first; those of files that hold no lot say why. With `drive`, manoeuvres are
     planned as `parkenv lot check` does.
     """
-    from parkenv.show.figures.census import save_census
-    from parkenv.show.figures.contact_sheet import save_contact_sheets
+    from parkenv.show.figures.lots import save_census, save_contact_sheets
 
     files = lot_files(places)
     make_folder(folder)

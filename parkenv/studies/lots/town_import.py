@@ -8,7 +8,7 @@ from typing import NamedTuple
 from parkenv.lots import write_lot
 from parkenv.lots.draft import ImportOptions, Provenance
 from parkenv.lots.osm.draft import LEAST_SPACES, import_car_parks
-from parkenv.show.figures.contact_sheet import save_contact_sheets
+from parkenv.show.figures.lots import save_contact_sheets
 from parkenv.show.plurals import plural
 from parkenv.studies.lots.drivability import check_drivability
 from parkenv.studies.results import Row

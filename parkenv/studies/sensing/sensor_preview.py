@@ -14,7 +14,7 @@ from parkenv.files.atomic_write import make_folder
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import WEATHERS
 from parkenv.show.figures.picture_files import save_film
-from parkenv.show.figures.sensors import save_sensor_preview, with_boxes
+from parkenv.show.figures.survey import save_sensor_preview, with_boxes
 from parkenv.studies.study import Progress, counted
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario

@@ -13,7 +13,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.files.file_names import file_name
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.distance_bins import DISTANCE_ENDS
-from parkenv.mapping.inference import SessionLog, predict
+from parkenv.mapping.inference import Prediction, SessionLog, predict
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, SurveySettings
 from parkenv.mapping.survey_score import METHODS
@@ -169,10 +169,8 @@ def draw_survey(
     with MapStore(folder / MAP_FILE, lot, create=False) as store:
         log = store.log()
         found = slots_found(store, len(log.time))
-    predicted = predict(log, DAY_S * window.weekdays[0] + 0.5 * (window.start_s + window.end_s))
-    true = mean_occupancy(scenario.occupancy, window)
     sessions = plural(row["sessions"], "session")
-    pictures.save_map(lot, predicted, true, f"{scenario.name} after {sessions}", path("map"))
+    predicted = draw_map(scenario, log, window, f"{scenario.name} after {sessions}", path("map"))
     if row["detection_by_distance"]:
         title = f"{scenario.name}, rig {settings.rig}, {sessions}"
         pictures.save_detection_reach(row["detection_by_distance"], title, path("reach"))
@@ -183,6 +181,17 @@ def draw_survey(
             pictures.save_localisation(lot, shown, path("localised"))
         pictures.save_graph(lot, predicted, shown, path("graph"))
     pictures.save_found_slots(lot, found, score_discovery(found, lot), path("slots_found"))
+
+
+def draw_map(
+    scenario: Scenario, log: SessionLog, window: ArrivalWindow, title: str, path: Path
+) -> Prediction:
+    """Draw what a map predicts for the middle of a window, beside the true probabilities; return the prediction."""
+    from parkenv.show.figures.survey import save_map  # loads Matplotlib
+
+    predicted = predict(log, DAY_S * window.weekdays[0] + 0.5 * (window.start_s + window.end_s))
+    save_map(scenario.lot, predicted, mean_occupancy(scenario.occupancy, window), title, path)
+    return predicted
 
 
 def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArray:

@@ -272,8 +272,7 @@ class TrainingSpec(Study):
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
-        from parkenv.show.report.learning import learning_panels
-        from parkenv.show.report.page import listed, on_scenarios
+        from parkenv.show.report.page import learning_panels, listed, on_scenarios
 
         rows = summary["rows"]
         agents = list(dict.fromkeys(str(row.get("agent", "agent")) for row in rows))

@@ -32,7 +32,7 @@ from parkenv.scenarios.selection import (
     scenario_of_episode,
     split_by_lot,
 )
-from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
+from parkenv.show.figures.times import TRAINING_COLORS, save_learning_curves
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, rows_of
@@ -421,9 +421,9 @@ class Training:
         Args:
             out: folder of this training.
         """
-        if len(self.spec.beside) >= len(COLORS):
+        if len(self.spec.beside) >= len(TRAINING_COLORS):
             raise InputError(
-                f"--beside names {len(self.spec.beside)} folders, want at most {len(COLORS) - 1}"
+                f"--beside names {len(self.spec.beside)} folders, want at most {len(TRAINING_COLORS) - 1}"
             )
         own, known = self.settings(), {os.path.realpath(out)}
         columns = ("steps", "total_s", "held_out_s") if self.holds_out else ("steps", "total_s")

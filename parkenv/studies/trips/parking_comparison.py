@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from parkenv.show.figures.parkings import save_parkings
+from parkenv.show.figures.manoeuvres import save_sheet
 from parkenv.show.figures.picture_files import save_film
+from parkenv.show.frames.drive import DriveRenderer
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress
 from parkenv.studies.trips.parking_runs import (
@@ -83,7 +84,7 @@ def _picture(parkings: list[Parking], cases: Sequence[ParkingCase], folder: Path
     failures = [p for p in parkings if not p.row["parked"]][:SHOWN_FAILURES]
     for shown, name in ((_one_of_each(parkings), "parkings.png"), (failures, "failures.png")):
         if shown:
-            save_parkings([(lots[p.row["lot"]], p.state) for p in shown], folder / name)
+            save_sheet([DriveRenderer(lots[p.row["lot"]]).frame(p.state) for p in shown], folder / name)
     if (film := _to_film(parkings)) is not None:
         case = next(case for case in cases if case.lot.name == film["lot"])
         frames = park_once(
