@@ -8,6 +8,7 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
@@ -15,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from parkenv.compiled.arrays import FloatArray
 from parkenv.show.figures.charts import COLORS, GREY, Line, Mark, Panel, Row, draw_panels, key_line, level
 from parkenv.show.figures.lot import draw_zones, zone_colors
-from parkenv.show.figures.picture_files import INK, picture, save_picture
+from parkenv.show.figures.picture_files import INK, STYLE, picture, save_picture
 from parkenv.world.lot import ParkingLot
 
 KNOWLEDGE_COLORS = {"own": INK, "shared": "#cc79a7", "reserve": "#0072b2", "full": "#009e73"}
@@ -23,6 +24,7 @@ _STYLES: tuple[tuple[Any, str], ...] = (("-", "o"), ("--", "s"), (":", "^"), ("-
 _SIMULATED = "#cc79a7"
 
 
+@mpl.rc_context(STYLE)
 def save_fleet_figure(
     rows: Sequence[Row],
     closed_form: Callable[[FloatArray], FloatArray],
@@ -184,7 +186,6 @@ def _by_hour(rows: Sequence[Row]) -> Panel:
 
 
 def _mark_hours(hours: Sequence[int], ax: Axes) -> None:
-    """Mark full hours on the horizontal axis, from the first of the hours to the end of the last one."""
     ax.set_xlim(min(hours), max(hours) + 1)
     ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     ax.xaxis.set_major_formatter(lambda hour, _: f"{hour:02.0f}:00")
@@ -228,6 +229,7 @@ class CarParkDays(NamedTuple):
     held_out: FloatArray  # (d, n_hours) cars counted on later days; NaN: not counted
 
 
+@mpl.rc_context(STYLE)
 def save_counted_demand(car_parks: Sequence[CarParkDays], hours: FloatArray, path: Path) -> None:
     """Draw the share of the places that is taken: simulated, as counted on the days followed, and on later ones."""
     columns = min(len(car_parks), 4)
@@ -261,6 +263,7 @@ _CURVE_COLORS = (*COLORS, "#666666")
 _POINTS = "#9a9a9a"
 
 
+@mpl.rc_context(STYLE)
 def save_curves(
     curves: Mapping[str, Curve],
     points: Sequence[Row],

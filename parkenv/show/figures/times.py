@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -32,7 +33,7 @@ from parkenv.show.figures.charts import (
     level,
     spread,
 )
-from parkenv.show.figures.picture_files import INK, picture, save_picture
+from parkenv.show.figures.picture_files import INK, STYLE, picture, save_picture
 from parkenv.show.plurals import LEAST_SEARCHES, plural
 from parkenv.world.cost_terms import COST_TERMS
 
@@ -70,10 +71,10 @@ Totals = Mapping[str, FloatArray]
 
 
 def agent_color(agent: str) -> str:
-    """Return the colour of an agent; agents of your own have one of five, by their name."""
     return AGENT_COLORS.get(agent, _OTHERS[crc32(agent.encode()) % len(_OTHERS)])
 
 
+@mpl.rc_context(STYLE)
 def draw_time_split(rows: Sequence[Row]) -> Figure:
     """Draw mean total times: a panel per setting, a bar per agent, split into drive, failed attempts and walk."""
     limit = _limit(rows)
@@ -290,8 +291,8 @@ def _scale_by_log(ax: Axes) -> None:
     ax.xaxis.set_minor_formatter(NullFormatter())
 
 
+@mpl.rc_context(STYLE)
 def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
-    """Draw the empirical distribution functions of total times, with each agent's mean as a dot on its curve."""
     if not panels or not any(panels.values()):
         raise InputError("no total times to draw")
     columns = len(panels) if len(panels) < 4 else 2 if len(panels) == 4 else 3
@@ -346,7 +347,6 @@ def _distribution(totals: Totals, title: str) -> Panel:
 
 
 def _limit(rows: Sequence[Row]) -> float:
-    """Return the upper limit of the total-time axis: above all totals within `OFF_SCALE` medians."""
     if not rows:
         raise InputError("no rows to draw")
     total = np.array([row["total_s"] for row in rows])
@@ -363,14 +363,12 @@ def _interval(row: Row) -> tuple[float, float]:
 
 
 def _name(rows: Sequence[Row]) -> str:
-    """Return the scenario that all rows share, as a title; empty if there are several."""
     names = {row.get("scenario") for row in rows} - {None}
     each = _each([int(row["episodes"]) for row in rows if "episodes" in row]).strip(" ()")
     return f"{names.pop()}{f', {each} each' if each else ''}" if len(names) == 1 else ""
 
 
 def _each(searches: Sequence[int]) -> str:
-    """Return the number of searches, in brackets; empty if it differs."""
     return f" ({plural(searches[0], 'search', 'searches')})" if len(set(searches)) == 1 else ""
 
 
@@ -384,6 +382,7 @@ _INK = "#444444"
 _NONE_LINE: dict[str, Any] = {"linewidth": 1.4, "linestyle": (0, (4, 2))}
 
 
+@mpl.rc_context(STYLE)
 def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
     """Draw a column of panels for each scenario and map: time and forecast error of each agent against the day.
 
