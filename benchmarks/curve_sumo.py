@@ -17,10 +17,9 @@ from benchmarks.town import SHIFT, SPEED, blocks_of
 from parkenv import make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots.generators import city_lot
-from parkenv.studies.curve.fit import Paths, Town, fit_curve
-from parkenv.studies.curve.lone_search import LoneSearches
-from parkenv.studies.curve.zones import LONE, OF_CARS, STATE, Zones
-from parkenv.studies.fleet.roads import Roads
+from parkenv.studies.curve.curves import Paths, Town, fit_curve
+from parkenv.studies.curve.zones import LONE, OF_CARS, STATE, LoneSearches, Zones
+from parkenv.studies.fleet.day import Roads
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
 from planners.heuristics import POLICIES
 

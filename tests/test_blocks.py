@@ -1,24 +1,23 @@
 """What a day with many cars tells: blocks, lanes and hours, in which no car, metre or coin is lost."""
 
-import json
 import re
 
 import numpy as np
 import pytest
 from small_lots import driven, features
+from test_report import data_of
 
 from parkenv import ParkingLot, fleet
 from parkenv.engine.records import STATES
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, NOWHERE, Blocks
 from parkenv.studies.fleet.day import ALL
-from parkenv.studies.fleet.day_map import town_data
+from parkenv.studies.fleet.day_replay import town_data
+from parkenv.studies.fleet.tables import BLOCKS, HOURS, LANES, NOWHERE, Blocks
 from parkenv.world.facility import Facility
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Two days in a small lot with a kerb, a garage and two zones, in which some cars find no slot."""
     folder, plain = tmp_path_factory.mktemp("blocks"), packaged_lot("mini")
     zone = np.where(plain.walk_m() <= np.median(plain.walk_m()), "centre", "")
     inside = {"capacity": 2, "xy": (10.0, 14.0), "gate_s": 5.0, "inside_s": (10.0, 30.0)}
@@ -45,16 +44,12 @@ def run(tmp_path_factory):
 
 
 BLOCKS_OF_RUN = {
-    ("Mill Street", "kerb", "centre", 3),
-    ("P1", "garage", "centre", 2),
-    ("centre", "zone", "centre", 2),
-    ("other", "zone", "other", 5),
-    (NOWHERE, NOWHERE, NOWHERE, 0),
-}
+    ("Mill Street", "kerb", "centre", 3), ("P1", "garage", "centre", 2), ("centre", "zone", "centre", 2),
+    ("other", "zone", "other", 5), (NOWHERE, NOWHERE, NOWHERE, 0),
+}  # fmt: skip
 
 
 def columns(run, table, purpose=ALL):
-    """The lines of a table about cars of a purpose, as arrays by column, for each day."""
     names, days = table.columns, []
     for row in run[0].results.rows(table).values():
         lines = {name: np.array(row[name]) for name in names}
@@ -96,7 +91,7 @@ def test_purposes_add_up_to_all_cars(run):
             for name in counts:
                 of_purposes = sum(part[day][name].sum() for part in parts)
                 assert of_purposes == pytest.approx(every[name].sum())
-    names = [one.name for one in run[0].study.built["zoned"].demand.purposes]
+    names = [purpose.name for purpose in run[0].study.built["zoned"].demand.purposes]
     for row in run[0].summary["purposes"]:
         days = [cars[cars["purpose"] == names.index(row["purpose"])] for cars in run[1]]
         search_s = np.mean([(cars["ended_at"] - cars["arrival"]).mean() for cars in days])
@@ -129,11 +124,10 @@ def test_zones_are_groups_of_blocks(run):
 
 
 def test_the_map_holds_the_means_of_the_tables_in_one_small_file(run):
-    text = (run[0].folder / "fleet.html").read_text(encoding="utf-8")
-    data = json.loads(re.search(r'id="report-data">(.*?)</script>', text, flags=re.DOTALL)[1])
+    text, data = (run[0].folder / "fleet.html").read_text(), data_of(run[0].folder / "fleet.html")
     (shown,), (town,) = data["maps"], data["towns"]
     assert [block["name"] for block in town["blocks"]] == ["Mill Street", "P1", "centre", "other"]
-    assert town["blocks"][0]["rules"] == "3 an hour"
+    assert town["blocks"][0]["rules"] == "per_hour 3"
     days = columns(run, BLOCKS)
     for number, block in enumerate(town["blocks"]):
         for i, hour in enumerate(shown["hours"]):

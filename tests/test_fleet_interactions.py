@@ -26,12 +26,10 @@ ROUTES = DriveRoutes(SCENARIO)
 
 
 def toward(slot, vertex):
-    """The action of a car that drives to a slot, and attempts to park there until it succeeds."""
     return PARK if vertex == slot else ROUTES.move_toward(vertex, int(slot))
 
 
 def drive(fleet, slots):
-    """Run a fleet in which each car parks in its slot; return the observations of each car."""
     seen = {}
     fleet.reset(0)
     while (car := fleet.next_decision()) is not None:
@@ -42,7 +40,6 @@ def drive(fleet, slots):
 
 
 def by_distance():
-    """Slots by the drive from the entry."""
     return np.argsort(ROUTES.seconds_from(int(LOT.entry_vertices[0]))[:8])
 
 

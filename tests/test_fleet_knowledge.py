@@ -27,7 +27,6 @@ TWO = Demand(ListedArrivals((36000.0, 36060.0)))
 
 
 def second_arrives(fleet, seed=0):
-    """Let the first car drive past slots until the second arrives; return what the second then knows of the slots."""
     fleet.reset(seed)
     viewed = set()
     while (car := fleet.next_decision()) != 1:

@@ -17,8 +17,7 @@ from parkenv.lots import write_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.drivers import demand_in
-from parkenv.studies.fleet.recorded_days import record_days
+from parkenv.studies.fleet.drivers import demand_in, record_days
 from parkenv.world.arrivals import Headways, NoArrivals, PoissonArrivals
 from parkenv.world.counted_demand import follow_counts
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, LogNormalTime, TownDemand

@@ -18,7 +18,7 @@ from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
-from parkenv.studies.fleet.columns import COLUMNS
+from parkenv.studies.fleet.setting import COLUMNS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -157,7 +157,7 @@ class Record(Command):
 
     def run(self) -> None:
         from parkenv.files.atomic_write import check_writable
-        from parkenv.studies.fleet.recorded_days import record_days
+        from parkenv.studies.fleet.drivers import record_days
 
         check_writable(self.out)
         console = make_console()

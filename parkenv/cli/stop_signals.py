@@ -8,9 +8,31 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.machinery import ExtensionFileLoader, SourceFileLoader
 from types import FrameType
 
-from parkenv.studies.interruption import unsafe_to_raise
+_IMPORTS = (
+    ExtensionFileLoader.create_module.__code__,
+    ExtensionFileLoader.exec_module.__code__,
+    SourceFileLoader.get_data.__code__,
+)
+"""Functions of importlib that import a compiled module, and that read a file of a module in Python."""
+_CALLED_BY_NUMBA = {"_numba_unpickle", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
+"""Functions of numba and llvmlite that compiled code calls: for the result of a function, and while LLVM compiles."""
+
+
+def unsafe_to_raise(frame: FrameType | None) -> bool:
+    """Return whether an exception raised in a frame would end the process, be lost or leave a file open.
+
+    Compiled code that called this code may end the process or lose the exception: modules in C++ while they are
+    imported, and numba while it compiles and while it makes Python objects. A file stays open where importlib has
+    opened a module's file and not yet entered its `with`: Python warns of that where warnings are on.
+    """
+    while frame is not None:
+        if frame.f_code in _IMPORTS or frame.f_code.co_name in _CALLED_BY_NUMBA:
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextmanager

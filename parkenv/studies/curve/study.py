@@ -7,37 +7,37 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.columns import Column
+from parkenv.show.plurals import plural
+from parkenv.show.report.tables import tables_of
 from parkenv.studies.fields import TRAFFIC, ScenarioList, Values
-from parkenv.studies.fleet.columns import COLUMNS
-from parkenv.studies.fleet.setting import OWN, SETTING_COLUMNS, Demanded, times_demanded
-from parkenv.studies.fleet.spec import FleetSpec
+from parkenv.studies.fleet.setting import COLUMNS, OWN, SETTING_COLUMNS, Demanded, times_demanded
+from parkenv.studies.fleet.study import FleetSpec
 from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.study import counted
 from parkenv.studies.workers import Task
 from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:
-    from parkenv.studies.curve.fit import Paths
-    from parkenv.studies.curve.lone_search import LoneSearches
-    from parkenv.studies.curve.zones import Zones
+    from parkenv.studies.curve.curves import Paths
+    from parkenv.studies.curve.zones import LoneSearches, Zones
     from parkenv.studies.fleet.day import Day
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 PICTURE = "curve.png"
+# Search times, s, of zones that were held out, by hour and demand: in the mean of the days, and by the curve that was
+# fitted to the others.
 HELD_OUT = Table(
-    "held_out.csv",
-    ("scenario", "zone", "hour", "multiple"),
-    ("cars", "occupancy", "measured", "predicted"),
+    "held_out.csv", ("scenario", "zone", "hour", "multiple"), ("cars", "occupancy", "measured", "predicted")
 )
-"""Search times, s, of zones that were held out, by hour and demand: in the mean of the days, and by the curve that was
-fitted to the others."""
 
 
 _ERRORS = (
@@ -46,6 +46,11 @@ _ERRORS = (
     Column("measured", "mean measured"),
     Column("bias", "curve, bias", share=True, signed=True),
 )
+
+
+# A line for each day: sums over the cars of a zone, purpose and hour where some arrive, and the `STATE` of zones by
+# hour, as `zones.day_of_zones` returns them. Hours count from the first of the day's arrivals.
+ZONES = Table("zones.jsonl", (*SETTING_COLUMNS, "day"))
 
 
 def _size(rate: float | str) -> float:
@@ -61,6 +66,7 @@ class CurveStudy(FleetSpec):
     demands, and those of the usual closed forms. Other models can read the files in --out.
     """
 
+    further_tables: ClassVar = (ZONES, HELD_OUT)
     heading: ClassVar = "Curves"
     table_titles: ClassVar = {"errors": "How far off where they were not fitted", "rows": "Whole lots"}
 
@@ -120,18 +126,12 @@ class CurveStudy(FleetSpec):
 
     @cached_property
     def _lone(self) -> dict[str, LoneSearches]:
-        from parkenv.studies.curve.lone_search import LoneSearches
+        from parkenv.studies.curve.zones import LoneSearches
 
         return {name: LoneSearches(goals) for name, goals in self._goals.items()}
 
-    @property
-    def further_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
-        from parkenv.studies.curve.zones import ZONES
-
-        return (ZONES, HELD_OUT)
-
     def day_tables(self, day: Day) -> dict[str, Row]:
-        from parkenv.studies.curve.zones import ZONES, day_of_zones
+        from parkenv.studies.curve.zones import day_of_zones
 
         name = day.fleet.scenario.name
         return {ZONES.file: day_of_zones(day, self.zones[name], self._lone[name])}
@@ -148,8 +148,7 @@ class CurveStudy(FleetSpec):
         return super().settings() | {"reach_m": self.reach_m}
 
     def _paths(self, results: Results) -> Paths | None:
-        from parkenv.studies.curve.fit import Paths, Town
-        from parkenv.studies.curve.zones import ZONES
+        from parkenv.studies.curve.curves import Paths, Town
         from parkenv.studies.fleet.day import purpose_names
 
         rows = results.rows(ZONES)
@@ -170,17 +169,20 @@ class CurveStudy(FleetSpec):
         return Paths.of(towns, [_size(rate) for rate in self.demands], first_hour)
 
     def _usual(self, name: str) -> float:
-        """Return a scenario's own demand as `demands` has it; in cars an hour, without its own, the middle one."""
+        # A scenario's own demand, as `demands` has it; in cars an hour, without its own, the middle one.
         own, window = self.built[name].demand, self.built[name].arrival
         middle = self.demands[len(self.demands) // 2]
-        if isinstance(middle, str):
-            return 1.0
-        return middle if own is None else own.expected / (window.end_s - window.start_s) * HOUR_S
+        per_hour = middle if own is None else own.expected / (window.end_s - window.start_s) * HOUR_S
+        return 1.0 if isinstance(middle, str) else float(per_hour)
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`; the curves, `curve.csv` and the files for other models, are written here."""
-        from parkenv.studies.curve.curves import write_curves
-        from parkenv.studies.curve.fit import OUTCOMES, curve_table, held_out_errors, held_out_parts
+        from parkenv.studies.curve.curves import (
+            OUTCOMES,
+            curve_table,
+            held_out_errors,
+            held_out_parts,
+            write_curves,
+        )
         from parkenv.studies.fleet.tables import summarize_days
 
         days = self.finished_days(results)
@@ -190,50 +192,50 @@ class CurveStudy(FleetSpec):
         fits = len(OUTCOMES) * (len([*held_out_parts(paths, self.seed)]) + 1 + self.bootstraps)
         how = self.seed, results.workers, counted(results.progress, "Fitting curves", fits)
         errors, held_out = held_out_errors(paths, *how)
+        # The curves, `curve.csv` and the files for other models, are written here.
         results.replace(held_out, HELD_OUT)
         write_curves(paths, curve_table(paths, self.bootstraps, *how), results.path)
         zones = {name: len(zones.names) for name, zones in self.zones.items()}
         return summary | {"zones": zones, "reach_m": self.reach_m, "errors": errors}
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        from parkenv.files.file_names import file_name
         from parkenv.show.figures.fleet import save_curves
-        from parkenv.show.plurals import plural
-        from parkenv.studies.curve.curves import load_curves
-        from parkenv.studies.curve.fit import PREDICTORS, fitted_forms
+        from parkenv.studies.curve.curves import FORMS, PREDICTORS, fit_form, form_at, load_curves
         from parkenv.studies.fleet.day import ALL
 
         if "zones" not in result.summary:
             return []
         curves, points = load_curves(result.folder).curves, [*result.results.rows(HELD_OUT).values()]
         tasks: list[Task[object]] = []
-        errors = [r for r in result.summary["errors"] if r["held_out"] == "zones"][:1]
+        errors = [row for row in result.summary["errors"] if row["held_out"] == "zones"][:1]
         off = {key: row[key] for row in errors for key in (*PREDICTORS, "chance")}
         for name, zones in self.zones.items():
             by_purpose = {p: curve for (s, z, p, h), curve in curves.items() if (s, z, h) == (name, ALL, ALL)}
             by_purpose = {ALL: by_purpose[ALL]} | by_purpose
             of_zones = [row for row in points if row["scenario"] == name]
+            x, y, cars = (
+                np.array([row[name] for row in of_zones]) for name in ("occupancy", "measured", "cars")
+            )
+            forms = (
+                {form: partial(form_at, form, fit_form(form, x, y, cars)) for form in FORMS} if len(x) else {}
+            )
             title = f"{name}: {plural(len(zones.names), 'zone')}, {plural(self.days, 'day')} of each demand"
             path = result.folder / (PICTURE if len(self.zones) == 1 else file_name(f"curve_{name}", ".png"))
-            tasks.append(partial(save_curves, by_purpose, of_zones, off, fitted_forms(of_zones), title, path))
+            tasks.append(partial(save_curves, by_purpose, of_zones, off, forms, title, path))
         return tasks
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        from parkenv.studies.curve.fit import CURVE, FORMS
-
-        findings = [
-            f"{row['outcome']}, {row['held_out']} held out: {row[CURVE]:.1%} off by zone-hours; the best of the usual "
-            f"forms {min(row[form] for form in FORMS):.1%}."
-            for row in summary["errors"][:1]
-        ]
-        return findings + [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
+        findings = [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
+        for row in summary["errors"][:1]:
+            findings.insert(
+                0, f"{row['outcome']}, {row['held_out']} held out: {row['curve']:.1%} off by zone-hours."
+            )
+        return findings
 
     @classmethod
     def page_tables(cls, summary: Row, folder: Path) -> list[Row]:
-        """See `Study`; predictors of errors are shares."""
-        from parkenv.show.report.tables import tables_of
-        from parkenv.studies.curve.fit import PREDICTORS
+        from parkenv.studies.curve.curves import PREDICTORS
 
         del folder
         labels = Column("held_out", "held out"), Column("outcome", "outcome")

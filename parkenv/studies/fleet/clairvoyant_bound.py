@@ -51,25 +51,9 @@ class ParkingDay(NamedTuple):
 
 
 def clairvoyant_bound_s(day: ParkingDay) -> float:
-    """Return a lower bound on the total time of all cars of a day, s.
-
-    The same day is computed once in a process: the settings of an experiment share their days.
-
-    Examples:
-        Two cars want the only slot at the same time. The drive takes 10 s, the walk 20 s; elsewhere costs 100 s.
-
-        >>> day = ParkingDay(
-        ...     np.zeros(2), np.full(2, 600.0), np.full(2, 300.0), np.zeros(2, np.int64),
-        ...     np.array([[10.0]]), np.array([20.0]), np.array([-np.inf]),
-        ...     np.zeros(1, np.int64), np.zeros((2, 1)), 100.0,
-        ... )
-        >>> 100.0 < clairvoyant_bound_s(day) <= 130.0
-        True
-    """
-    digest = hashlib.sha256(repr(day.give_up_s).encode())
-    for column in day[:-1]:
-        digest.update(repr(np.shape(column)).encode() + np.ascontiguousarray(column).tobytes())
-    key = digest.digest()
+    # The same day is computed once in a process: the settings of an experiment share their days.
+    columns = (repr(np.shape(column)).encode() + np.ascontiguousarray(column).tobytes() for column in day)
+    key = hashlib.sha256(b"".join(columns)).digest()
     if key not in _BOUNDS:
         _BOUNDS[key] = _bound_s(day)
     return _BOUNDS[key]
@@ -111,7 +95,7 @@ def _bound_s(day: ParkingDay) -> float:
 
 @compiled(error_model="numpy")
 def _schedule_in_order(day: ParkingDay) -> float:
-    """Return the total time, s, if each car in order of arrival parks where it is soonest at its goal."""
+    # Each car in order of arrival parks where it is soonest at its goal.
     total_s = 0.0
     free_from = day.free_from.copy()
     for i in range(len(day.arrival)):
@@ -133,12 +117,8 @@ def _raise_rents(
 ) -> tuple[float, FloatArray]:
     """Return the best lower bound, s, of some subgradient steps, and its rents, (n_parts, n_bins).
 
-    Args:
-        day: the day.
-        order: (n_entries, n_slots) slots, soonest at the goal first if they were without prices.
-        part: (n_slots,) part of each slot.
-        rents: (n_parts, n_bins) first rents, s per s; changed.
-        target_s: s, total time of a schedule, at which the steps aim (Polyak).
+    `order` are the slots of each entry, soonest at the goal first if they were without prices; `part` is that of each
+    slot; `rents`, s per s, are changed; the steps aim at the total time of a schedule, `target_s` (Polyak).
     """
     n_parts, n_bins = rents.shape
     free_s = np.zeros((n_parts, n_bins))
@@ -192,7 +172,7 @@ def _raise_rents(
 def _best_place(
     car: int, order: IntArray, part: IntArray, rents: FloatArray, paid: FloatArray, day: ParkingDay
 ) -> tuple[float, int, float, int]:
-    """Return the least cost with rent of a car, s, its slot, -1 for elsewhere, when it parks, s, and the work."""
+    """Return the least cost with rent of a car, s, its slot, -1 for elsewhere, when it parks, and the work."""
     arrival, stay_s, entry = day.arrival[car], day.stay_s[car], day.entry[car]
     best, chosen, parks_at, work = day.give_up_s, -1, 0.0, 0
     for j in order[entry]:

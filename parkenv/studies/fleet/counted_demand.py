@@ -31,8 +31,6 @@ _COUNTED_HOURS = 0.5  # of the hours, in which a car park that is followed has t
 
 
 class CountedTown:
-    """The counted facilities of a lot that have counts, their days, and the fleet that drives there."""
-
     def __init__(self, spec: ScenarioSpec, counts: Counts, agent: AgentSpec) -> None:
         self.scenario = build(spec.changed(demand={}))
         self.spec, self.policy = spec, compiled_policy_of(agent, self.scenario)
@@ -56,10 +54,7 @@ class CountedTown:
         self.map_weight, self._goals = self._attraction()
 
     def _attraction(self) -> tuple[FloatArray, FloatArray]:
-        """Return the lot's weight of the goals nearest to each car park, (n,), and weights of its own goals, (n, g).
-
-        Of a car park's own goals nearly all cars, or as many as of any goal, would park there if nothing was full.
-        """
+        """Return the weight of the goals nearest to each car park, (n,), and weights of its own goals, (n, g)."""
         lot, scenario = self.scenario.lot, self.scenario
         weight = np.array(weights_of_all(lot.goal_weights) or np.ones(len(lot.goals)))
         walk_m = np.array([lot.walk_m(goal)[self.slots] for goal in range(len(lot.goals))])
@@ -70,6 +65,7 @@ class CountedTown:
         best = (drive_s[:, None] + arrival_s).argmin(axis=2)  # of each entry and goal
         traffic = np.array(weights_of_all(lot.entry_weights) or np.ones(len(lot.entries)))
         share = np.array([traffic @ (best == number) for number in numbers]) / traffic.sum()
+        # Of its own goals nearly all cars, or as many as of any goal, would park there if nothing was full.
         chosen = share >= np.minimum(share.max(axis=1, keepdims=True), _NEARLY_ALL)
         own = np.where(chosen, np.maximum(weight, 1e-9), 0.0)
         unchosen = share.max(axis=1) == 0.0
@@ -89,15 +85,13 @@ class CountedTown:
         return before.T, cars[:, days][:, :, self.hours].transpose(1, 0, 2)
 
     def expected(self, forecast: FloatArray, days: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return `cars` of the forecasts made before each day; what was counted at midnight is known by then."""
         before, hours = self.cars(forecast, days)
-        if not self.hours[0]:
+        if not self.hours[0]:  # what was counted at midnight is known by then
             known, _ = self.cars(self.counts.seen, days)
             before = np.where(np.isfinite(known), known, before)
         return before, hours
 
     def mean(self, cars: FloatArray) -> FloatArray:
-        """Return the mean over days; NaN for hours, or car parks, that were rarely counted."""
         known = np.isfinite(cars)
         mean: FloatArray = np.nansum(cars, axis=0) / np.maximum(known.sum(axis=0), 1)
         mean[~known.any(axis=0)] = np.nan
@@ -108,10 +102,6 @@ class CountedTown:
     def purposes(
         self, at_first: FloatArray, cars: FloatArray, stays_h: Mapping[str, tuple[float, ...]]
     ) -> dict[str, PurposeSpec]:
-        """Return a purpose for each counted car park, with which it would have so many cars at the ends of the hours.
-
-        Mean stays are those given, h, or else chosen.
-        """
         specs = {}
         for name, goals, first, counted_cars in zip(self.names, self._goals, at_first, cars, strict=True):
             if not np.isfinite(counted_cars).any():
@@ -135,12 +125,9 @@ class CountedTown:
     def fitted(self, days: IntArray, rounds: int, episodes: int, seed: int) -> dict[str, Row]:
         """Fit a purpose for each car park to the mean of its counts on some days, (d,); the fleet drives for it.
 
-        What car parks lack or have too much is added to what the next round follows.
-
-        Returns:
-            By the name of each car park that was counted: the table of its `purpose`, and cars at the ends of the
-            hours, None where nobody counted: `followed`, as counted; `driven`, of the last round; `aim`, what a further
-            round would follow.
+        What car parks lack or have too much is added to what the next round follows. Of each car park that was counted
+        there are the table of its `purpose`, and cars at the ends of the hours: `followed`, as counted; `driven`, of
+        the last round; `aim`, what a further round would follow.
         """
         at_first, cars = (self.mean(values) for values in self.cars(self.counts.occupied, days))
         if not np.isfinite(cars).any():
@@ -170,17 +157,9 @@ class CountedTown:
     ) -> Row:
         """Drive a day with the demand that its forecast tells: the mean of some days of the fleet.
 
-        Args:
-            day: index of the day.
-            fit: of the weeks before, see `fitted`; its stays and corrections hold on this day, too.
-            before: (n,) cars that are there when the day begins.
-            expected: (n, n_hours) cars by the forecast that was made before the day.
-            episodes: number of days of the fleet.
-            seed: of these days.
-
-        Returns:
-            Columns, with a line for each car park and hour where all are known: `car_park`, `hour`, and shares of the
-            places at the end of the hour, `counted`, and as it was to be expected.
+        Cars there when the day begins, `before`, are (n,), those by the forecast before it, `expected`, (n, n_hours).
+        Stays and corrections are those of the `fit` of the weeks before. Columns have a line for each car park and hour
+        where all are known: shares of the places at the end of the hour, `counted`, and as it was to be expected.
         """
         aim, followed, simulated = np.full((3, *expected.shape), np.nan)
         known = [k for k, name in enumerate(self.names) if name in fit]
@@ -209,7 +188,6 @@ class CountedTown:
         }
 
     def driven(self, purposes: Mapping[str, PurposeSpec], seed: int, days: range) -> FloatArray:
-        """Return the mean cars in the car parks at the end of each hour of days of the fleet, (n, n_hours)."""
         scenario = self.scenario
         demand = demand_of({**self.spec.demand, **purposes}, scenario.lot, scenario.arrival)
         if self._fleet is None:

@@ -1,85 +1,218 @@
-"""Record days with many cars for the replay of a report."""
+"""Reports of days with many cars: maps of blocks and lanes by hour, and replays of every car."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.engine.fleet import Fleet
-from parkenv.engine.records import LEFT, NO_CAR, PARKED
-from parkenv.show.scene import LotScene
+from parkenv.engine.records import LEFT, NO_CAR, PARKED, STATES
+from parkenv.show.report.page import page_data, write_page
+from parkenv.show.scene import SQUARE, Lines, LotScene, building_layers, layer_data, rounded
+from parkenv.studies.fleet.day import ALL
 from parkenv.studies.fleet.setting import Setting, rate_text
+from parkenv.studies.fleet.tables import BLOCKS, HOURS, LANES, TABLES, Blocks, by_hour
 from parkenv.studies.report import AGREES_S, MOST_SLOTS, Recording, ReplayJob
 from parkenv.studies.report_options import ReportOptions
-from parkenv.studies.results import Key
+from parkenv.studies.results import Key, Row, without_nan
+from parkenv.world.lot import ParkingLot, is_building
+from parkenv.world.scenario import Scenario
+from parkenv.world.tariff import PUBLIC, Zone
 
 if TYPE_CHECKING:
     from parkenv.studies.fleet.study import FleetStudy
 
-MOST_CARS = 5_000
-"""Demands with which more cars come on a day are not replayed: the page would not load."""
+MOST_MAPS = 6
+LANE_WIDTH = 5.5  # m
+GAP = 1.2  # m between slots of a block up to which they are drawn as one area
+COUNTED_AREA, LEAST_SIDE = 6.0, 12.0  # m2 of a counted facility for each car that fits, and its least side, m
+MOST_NUMBERS = 1_500_000  # numbers of all maps of a page: with more, it would load slowly
+Rows = Mapping[str, Sequence[Row]]  # rows of each of `TABLES`, by its file
+
+
+def map_replay(study: FleetStudy, folder: Path) -> ReplayJob:
+    rows = {table.file: table.read(folder) for table in TABLES}
+    return ReplayJob([partial(dict, recording) for recording in map_recordings(study, rows)])
+
+
+def write_map_page(study: FleetStudy, summary: Row, rows: Rows, folder: Path) -> None:
+    told = without_nan(summary)
+    page = page_data("fleet", study.page(told, folder), told, map_recordings(study, rows))
+    write_page(page, folder / "fleet.html")
+
+
+def map_recordings(study: FleetStudy, rows: Rows) -> list[Recording]:
+    shown = study.shown_settings
+    settings = [*shown, *(setting for setting in study.fleet_settings if setting not in shown)][:MOST_MAPS]
+    scenarios = {setting.scenario: study.built[setting.scenario] for setting in settings}
+    towns = {name: town_data(s.lot, [*map(rules_text, s.zone_rules)]) for name, s in scenarios.items()}
+    maps: list[Recording] = []
+    numbers = 0
+    for setting in settings:
+        days = {file: [row for row in of_table if setting.holds(row)] for file, of_table in rows.items()}
+        if days[BLOCKS.file]:
+            town, data = towns[setting.scenario], _map(study.built[setting.scenario], setting, days)
+            numbers += 6 * len(town["blocks"]) * len(data["hours"])
+            if not maps or numbers <= MOST_NUMBERS:
+                maps.append({"town": town, "map": data})
+    return maps
+
+
+def town_data(lot: ParkingLot, rules: Sequence[str]) -> dict[str, Any]:
+    # Lengths are in m, rounded to decimetres.
+    blocks = Blocks.of(lot)
+    first = np.unique(blocks.of_slot, return_index=True)[1]
+    rules_of = [rules[zone] for zone in lot.zone_of_slot[first].tolist()]
+    columns = blocks.names, blocks.types, blocks.zones, blocks.slots.tolist(), rules_of
+    names = ("name", "type", "zone", "slots", "rules")
+    lanes = [lane.points for lane in lot.lanes]
+    buildings = [wall for wall in lot.walls if is_building(wall)]
+    walls = [wall for wall in lot.walls if not is_building(wall)]
+    ground = [*building_layers(buildings, walls), Lines(lanes, "asphalt", LANE_WIDTH, (1.5, LANE_WIDTH))]
+    return {
+        "name": lot.name,
+        "bounds": rounded(np.array(lot.bounds()), 1),
+        "ground": [layer_data(layer, 1) for layer in ground],
+        "lanes": [rounded(points, 1) for points in lanes],
+        "goals": [rounded(xy, 1) for xy in lot.goals],
+        "blocks": [
+            dict(zip(names, block, strict=True)) | _place(lot, np.flatnonzero(blocks.of_slot == number))
+            for number, block in enumerate(zip(*columns, strict=True))
+        ],
+    }
+
+
+def _place(lot: ParkingLot, slots: IntArray) -> dict[str, Any]:
+    # A counted facility is a square as large as its slots would be on a few storeys.
+    facility = lot.facilities[lot.facility_of_slot[slots[0]]] if lot.facility_of_slot[slots[0]] >= 0 else None
+    if facility is not None and facility.xy is not None and facility.is_counted:
+        side = max(math.sqrt(COUNTED_AREA * facility.capacity), LEAST_SIDE)
+        square = np.array(facility.xy) + side * SQUARE
+        return {"at": rounded(np.array(facility.xy), 1), "areas": [[rounded(square, 1)]]}
+    corners = shapely.polygons(lot.slot_corners()[slots])
+    joined = shapely.union_all(shapely.buffer(corners, GAP / 2, join_style="mitre"))
+    area = shapely.simplify(shapely.buffer(joined, 0.2 - GAP / 2, join_style="mitre"), 0.2)
+    xy = lot.slot_xy[slots]
+    middle = xy[np.argmin(np.hypot(*(xy - xy.mean(axis=0)).T))]
+    return {
+        "at": rounded(middle, 1),
+        "areas": [
+            [rounded(shapely.get_coordinates(ring)[:-1], 1) for ring in (part.exterior, *part.interiors)]
+            for part in shapely.get_parts(area)
+        ],
+    }
+
+
+def rules_text(zone: Zone) -> str:
+    """Return the rules of a zone as a lot file names them; empty if everyone may park there for nothing.
+
+    Examples:
+        >>> from parkenv.world.tariff import Price
+        >>> rules_text(Zone("inner", Price(2.0, free_s=900.0), max_stay_s=7200.0))
+        'per_hour 2; free_s 900; max_stay_s 7200'
+    """
+    rules = zone.price.members() | {"max_stay_s": zone.max_stay_s, "hours": zone.hours}
+    rules["users"] = None if PUBLIC in zone.users else ", ".join(zone.users)
+    shown = {name: f"{value:g}" if isinstance(value, float) else value for name, value in rules.items()}
+    return "; ".join(f"{name} {value}" for name, value in shown.items() if value is not None)
+
+
+def _map(scenario: Scenario, setting: Setting, rows: Rows) -> dict[str, Any]:
+    names, hours, means = by_hour(rows[BLOCKS.file], "block")
+    # Cars that arrive late park after the last look at the slots.
+    known = np.isfinite(means["occupancy"]).any(axis=0)
+    order = [names.index(name) for name in Blocks.of(scenario.lot).names]
+    hours = np.array(hours)[known].tolist()
+    grid = {name: values[order][:, known] for name, values in means.items()}
+    with np.errstate(invalid="ignore", divide="ignore"):
+        grid |= {name: grid[name] / grid["parked"] for name in ("search_s", "walk_s")}
+    digits = {"occupancy": 3, "arrivals": 2, "refused": 2, "search_s": 0, "walk_s": 0, "paid": 2}
+    return {
+        **setting.columns,
+        "days": len(rows[BLOCKS.file]),
+        "hours": hours,
+        "blocks": {name: without_nan(np.round(grid[name], digit).tolist()) for name, digit in digits.items()},
+        "lanes": _cruised(rows[LANES.file], hours),
+        "states": {state: _mean_states(rows[HOURS.file], state, hours) for state in STATES},
+    }
+
+
+def _cruised(rows: Sequence[Row], hours: Sequence[int]) -> list[list[int]]:
+    metres: dict[int, FloatArray] = {}
+    for row in rows:
+        for lane, hour, cruised in zip(row["lane"], row["hour"], row["cruised_m"], strict=True):
+            if hour in hours and cruised:
+                metres.setdefault(lane, np.zeros(len(hours)))[hours.index(hour)] += cruised / len(rows)
+    return [[lane, *np.round(by_hour).astype(int).tolist()] for lane, by_hour in sorted(metres.items())]
+
+
+def _mean_states(rows: Sequence[Row], state: str, hours: Sequence[int]) -> list[float]:
+    # A day that is over stays as it is.
+    days = []
+    for row in rows:
+        cars = [count for count, purpose in zip(row[state], row["purpose"], strict=True) if purpose == ALL]
+        days.append([cars[min(hour - row["hour"][0], len(cars) - 1)] for hour in hours])
+    return [round(float(mean), 1) for mean in np.mean(days, axis=0)]
+
+
+MOST_CARS = 5_000  # demands with which more cars come on a day are not replayed: the page would not load
+# What a car does on its way to a point of its track: drive; a failed attempt, a queue and a wait leave it there.
 DRIVE, FAIL, QUEUE, WAIT = range(4)
-"""What a car does on its way to a point of its track: drive; a failed attempt, a queue and a wait leave it there."""
-STRAIGHT_M = 0.1
-"""A car that drives on at the same speed needs no point in between if it is that close to a straight line, m."""
-DAYS = 8
-"""Default number of replayed days."""
+DAYS = 8  # default number of replayed days
 
 
 def day_replay(study: FleetStudy, folder: Path, options: ReportOptions) -> ReplayJob:
-    """Return the days to run again; lots with too many slots or counted ones, and crowded days, are left out.
-
-    Args:
-        study: the study.
-        folder: folder of the run; means are compared with those in `days.csv`.
-        options: which days.
-    """
     agents = options.chosen_agents([setting.agent.label for setting in study.fleet_settings])
     numbers = options.chosen_numbers(range(study.days))
-    if (n := max(scenario.lot.n_slots for scenario in study.built.values())) > MOST_SLOTS:
+    lots = [scenario.lot for scenario in study.built.values()]
+    if (n := max(lot.n_slots for lot in lots)) > MOST_SLOTS:
         return ReplayJob(
             notes=[f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
         )
-    if any((scenario.lot.capacity > 1).any() for scenario in study.built.values()):
+    if any((lot.capacity > 1).any() for lot in lots):
         return ReplayJob(notes=["counted facilities have no slots to draw: no replay; the map has them"])
-    settings = [one for one in study.fleet_settings if one.agent.label in agents]
     rows = study.table.read(folder)
     crowded = {row["arrivals_per_hour"] for row in rows if row["cars"] > MOST_CARS}
-    rates = [rate for rate in study.demands if rate in crowded]
     notes = [
         f"days with {rate_text(rate)} have more than the {MOST_CARS} cars that are drawn: no replay"
-        for rate in rates
+        for rate in study.demands
+        if rate in crowded
     ]
-    settings = [one for one in settings if one.arrivals_per_hour not in rates]
+    settings = [
+        setting
+        for setting in study.fleet_settings
+        if setting.agent.label in agents and setting.arrivals_per_hour not in crowded
+    ]
     chosen = choose_days(study, settings, DAYS if options.episodes is None else options.episodes, numbers)
     totals = {study.table.key(row): row["total_s"] for row in rows}
     return ReplayJob([partial(record_day, study, setting, day, totals) for setting, day in chosen], notes)
 
 
 def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[Key, float]) -> Recording:
-    """Repeat a day, and record it: times in centiseconds since the day's arrivals begin."""
     fleet, agents = study.fleet(setting)
     scenario = fleet.scenario
     fleet.keep_steps()
     fleet.reset(study.seed, day)
     fleet.run(agents, until=fleet.begin)
-    residents = fleet.slots["leaves_at"].copy()
+    leaves_at = fleet.slots["leaves_at"].copy()
     fleet.run(agents)
     cars, begin = fleet.cars, fleet.begin
     mean_s = float(cars["total_s"][cars["parked_at"] < 0].mean())
     before = counted.get(study.keys(setting, day)[0])
     agrees = None if before is None else abs(before - mean_s) <= AGREES_S
-    ran = f"{setting}, day {day}: run again the mean was {mean_s:.2f} s, days.csv says"
-    stay = np.flatnonzero(residents > begin)
-    parked = np.isin(cars["state"], (PARKED, LEFT))
-    left = _centiseconds(cars["ended_at"] + cars["stay_s"] - begin)
+    difference = (
+        f"{setting}, day {day}: run again the mean was {mean_s:.2f} s, days.csv says {before or 0.0:.2f} s"
+    )
+    stays = np.flatnonzero(leaves_at > begin)
+    residents = np.stack([stays, _centiseconds(leaves_at[stays] - begin)], axis=1)
     return {
         "lot": LotScene.of(scenario.lot).data(),
         "fleet": {
@@ -93,96 +226,58 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
             "total_s": mean_s,
             "counted_s": before,
             "agrees": agrees,
-            # slot and time of departure of each car that is parked when the day begins
-            "residents": np.stack([stay, _centiseconds(residents[stay] - begin)], axis=1).ravel().tolist(),
-            "arrival": _centiseconds(cars["arrival"] - begin).tolist(),
-            "ended": _centiseconds(cars["ended_at"] - begin).tolist(),
-            "slot": np.where(parked, cars["slot"], NO_CAR).tolist(),
-            "leaves": np.where(parked & np.isfinite(cars["stay_s"]), left, -1).tolist(),
-            "member": (cars["kind"] == 0).astype(int).tolist(),
+            # Slot and departure of each car that is parked when the day begins.
+            "residents": residents.astype(int).ravel().tolist(),
+            **_cars(cars, begin),
             "tracks": _tracks(fleet),
         },
-        "differences": [f"{ran} {before:.2f} s"] if agrees is False else [],
+        "differences": [difference] if agrees is False else [],
     }
 
 
 def choose_days(
     study: FleetStudy, settings: Sequence[Setting], count: int, days: Sequence[int] | None = None
 ) -> list[tuple[Setting, int]]:
-    """Choose days for a replay.
+    """Return all of some `days`, or so many: the first day of each setting, then the next one."""
+    numbers = range(study.days) if days is None else days
+    pairs = [(number, day) for day in numbers for number in range(len(settings))]
+    return [(settings[number], day) for number, day in sorted(pairs if days is not None else pairs[:count])]
 
-    Args:
-        study: the study.
-        settings: settings to choose from.
-        count: number of days to choose: the first day of each setting, those in which all or none are members first,
-            then the next day.
-        days: all of these days instead.
-    """
-    if days is not None or not settings:
-        return [(setting, day) for setting in settings for day in days or ()]
-    most = max(setting.share for setting in settings)
-    order = sorted(range(len(settings)), key=lambda i: settings[i].share not in (0.0, most))
-    needed = min(study.days, -(-count // len(settings)))
-    chosen = [(i, day) for day in range(needed) for i in order][:count]
-    return [(settings[i], day) for i, day in sorted(chosen)]
+
+def _cars(cars: NDArray[np.void], begin: float) -> dict[str, list[int]]:
+    parked = np.isin(cars["state"], (PARKED, LEFT))
+    leaves = np.where(parked, cars["ended_at"] + cars["stay_s"], np.inf)
+    lists = {
+        "arrival": _centiseconds(cars["arrival"] - begin),
+        "ended": _centiseconds(cars["ended_at"] - begin),
+        "slot": np.where(parked, cars["slot"], NO_CAR),
+        "leaves": np.where(np.isfinite(leaves), _centiseconds(leaves - begin), -1),
+        "member": cars["kind"] == 0,
+    }
+    return {name: values.astype(int).tolist() for name, values in lists.items()}
 
 
 def _tracks(fleet: Fleet) -> list[list[int]]:
-    """Return the track of each car: its entry; for each point the centiseconds to it, and 4 x vertex + what it does.
-
-    The position is linear in between.
-    """
-    xy, cars, begin = fleet.scenario.lot.vertex_xy, fleet.cars, fleet.begin
-    steps = fleet.steps
-    steps = steps[np.argsort(steps["car"], kind="stable")]
+    """Return the track of each car: its entry; for each point the centiseconds to it, and 4 x vertex + what it does."""
+    cars, steps = fleet.cars, fleet.steps[np.argsort(fleet.steps["car"], kind="stable")]
     first = np.searchsorted(steps["car"], np.arange(len(cars) + 1))
-    ways = cars[["entry", "arrival", "ended_at"]].tolist()
-    return [_track(steps[first[i] : first[i + 1]], xy, begin, *way) for i, way in enumerate(ways)]
+    tracks = []
+    for number, (entry, arrival, ended) in enumerate(cars[["entry", "arrival", "ended_at"]].tolist()):
+        times, codes, vertex = [arrival], [entry], entry
+        for _, started, end, origin, target, failed in steps[first[number] : first[number + 1]].tolist():
+            if started > times[-1]:
+                times.append(started)
+                codes.append(4 * vertex + QUEUE)
+            times.append(end)
+            codes.append(4 * target + (FAIL if failed else DRIVE if target != origin else WAIT))
+            vertex = target
+        if ended > times[-1]:
+            times.append(ended)
+            codes.append(4 * vertex + QUEUE)
+        elapsed = np.diff(_centiseconds(np.array(times) - fleet.begin))
+        tracks.append([entry, *np.stack([elapsed, codes[1:]], axis=1).astype(int).ravel().tolist()])
+    return tracks
 
 
-def _track(
-    steps: NDArray[np.void], xy: FloatArray, begin: float, entry: int, arrival: float, ended: float
-) -> list[int]:
-    points: list[tuple[float, int, int]] = []  # time, vertex, what the car does until then
-    time, vertex = arrival, entry
-    for _, started, end, origin, target, failed in steps.tolist():
-        if started > time:
-            points.append((started, vertex, QUEUE))
-        kind = FAIL if failed else DRIVE if target != origin else WAIT
-        points.append((end, target, kind))
-        time, vertex = end, target
-    if ended > time:
-        points.append((ended, vertex, QUEUE))
-    points = _without_straight(points, xy, arrival, entry)
-    elapsed = np.diff(_centiseconds(np.array([arrival, *(when for when, _, _ in points)]) - begin)).tolist()
-    codes = [4 * vertex + kind for _, vertex, kind in points]
-    return [entry, *chain.from_iterable(zip(elapsed, codes, strict=True))]
-
-
-def _without_straight(
-    points: Sequence[tuple[float, int, int]], xy: FloatArray, time: float, vertex: int
-) -> list[tuple[float, int, int]]:
-    """Leave out points at which a car drives straight on at the same speed."""
-    bends: list[tuple[float, int, int]] = []
-    x0, y0 = xy[vertex]
-    speed: tuple[float, float] | None = None  # of the straight line under way, m/s
-    start = time
-    for i, (when, at, kind) in enumerate(points):
-        x, y = xy[at]
-        if kind == DRIVE and when > start and speed is None:
-            speed = (x - x0) / (when - start), (y - y0) / (when - start)
-        follows = points[i + 1] if i + 1 < len(points) else None
-        if kind == DRIVE and speed is not None and follows is not None and follows[2] == DRIVE:
-            ahead, elapsed = xy[follows[1]], follows[0] - start
-            off = max(abs(x0 + speed[0] * elapsed - ahead[0]), abs(y0 + speed[1] * elapsed - ahead[1]))
-            if off <= STRAIGHT_M:
-                continue
-        bends.append((when, at, kind))
-        x0, y0, start, speed = x, y, when, None
-    return bends
-
-
-def _centiseconds(seconds: Any) -> NDArray[np.int64]:
-    """Return times in whole centiseconds; those of what never happens are 0."""
-    rounded: NDArray[np.int64] = np.round(100 * np.where(np.isfinite(seconds), seconds, 0.0)).astype(np.int64)
-    return rounded
+def _centiseconds(seconds: Any) -> Any:
+    return np.rint(100 * seconds)

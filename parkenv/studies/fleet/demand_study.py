@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
     from parkenv.studies.workers import Task
 
-PREDICTIONS = ("simulated", "forecast", "last_week", "mean_followed")
-"""Predictions of the counts."""
+PREDICTIONS = ("simulated", "forecast", "last_week", "mean_followed")  # predictions of the counts
 COLUMNS = (
     Column("car_park", "car park"),
     Column("capacity", "places", digits=0),
@@ -46,24 +45,16 @@ COLUMNS = (
     Column("fit_error", "error, fit", share=True),
     *(Column(f"{name}_error", f"error, {name.replace('_', ' ')}", share=True) for name in PREDICTIONS),
 )
+# Mean difference from the counts, share of the places, above which a car park is said not to be followed.
 FAR_OFF = 0.15
-"""Mean difference from the counts, share of the places, above which a car park is said not to be followed."""
+# Weekdays (Monday = 0) that have a demand of their own, by the name of its scenario file.
 KINDS: dict[str, tuple[int, ...]] = {"scenario": (0, 1, 2, 3, 4), "saturday": (5,), "sunday": (6,)}
-"""Weekdays (Monday = 0) that have a demand of their own, by the name of its scenario file."""
 
 
 class _RollOut(NamedTuple):
-    """Weeks that are followed, and later ones that are held out.
-
-    Attributes:
-        number: of the roll-out.
-        fit: of the kind of a day held out, by car park; see `CountedTown.fitted`.
-        expected: `before` and `expected` of that day; see `CountedTown.predicted`.
-    """
-
     number: int
-    fit: Mapping[str, Row] = {}
-    expected: tuple[FloatArray, ...] = ()
+    fit: Mapping[str, Row] = {}  # of the kind of a day held out, by car park; see `CountedTown.fitted`
+    expected: tuple[FloatArray, ...] = ()  # `before` and `expected` of that day; see `CountedTown.predicted`
 
     @property
     def columns(self) -> Row:
@@ -71,8 +62,7 @@ class _RollOut(NamedTuple):
 
 
 FITTED = Table("fitted.jsonl", ("roll_out", "kind"))
-DAYS = Table("days.jsonl", ("date",))
-"""Days held out; see `CountedTown.predicted`."""
+DAYS = Table("days.jsonl", ("date",))  # days held out; see `CountedTown.predicted`
 
 
 class DemandStudy(Study):
@@ -137,7 +127,7 @@ class DemandStudy(Study):
         return CountedTown(self.scenario, Counts.read(self.counts, self.timezone), self.agent)
 
     def days(self, roll_out: int) -> tuple[IntArray, IntArray]:
-        """Return the days that are followed, and those held out, as indices into those of the counts."""
+        # Those that are followed, and those held out, as indices into the days of the counts.
         first = self._first + timedelta(weeks=self.held_out * roll_out)
         later = first + timedelta(weeks=self.weeks)
         end = later + timedelta(weeks=self.held_out)
@@ -147,23 +137,16 @@ class DemandStudy(Study):
     def _first(self) -> date:
         return self.from_day or self.town.counts.days[0]
 
-    @property
-    def _first_held_out(self) -> int:
-        return self.town.counts.day_index(self._first + timedelta(weeks=self.weeks))
-
     def check(self) -> None:
         counts = self.town.counts
-        if not 0 < self._first_held_out < len(counts.days):
-            from parkenv.show.plurals import plural
-
+        if not 0 < counts.day_index(self._first + timedelta(weeks=self.weeks)) < len(counts.days):
             raise InputError(
                 f"--from is {self._first}: {counts.source} has counts from {counts.days[0]} to {counts.days[-1]}, "
                 f"want {plural(self.weeks, 'week')} and days after these among them"
             )
         if not len(self.days(self.roll_outs - 1)[1]):
             raise InputError(
-                f"roll_outs is {self.roll_outs}, want no more than have days held out by {counts.days[-1]}, the last "
-                f"one of {counts.source}"
+                f"roll_outs is {self.roll_outs}, want fewer: {counts.source} ends with {counts.days[-1]}"
             )
 
     def settings(self) -> Row:
@@ -186,7 +169,8 @@ class DemandStudy(Study):
         yield Stage(fits.doing, fits, fits.cells())
         counts = self.town.counts
         done = counted(results.progress, "Forecasting", FIT_STEPS)
-        settings = fit_settings(counts, self._first_held_out, done)
+        first_held_out = counts.day_index(self._first + timedelta(weeks=self.weeks))
+        settings = fit_settings(counts, first_held_out, done)
         forecast = forecast_days(counts, 0, "rolling", settings).occupancy
         cells = []
         for work, dates in self.cells():
@@ -208,19 +192,18 @@ class DemandStudy(Study):
         return self.agent.label
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`: mean absolute errors of the fits on the weeks followed, and of all predictions on later days."""
         from scipy.stats import spearmanr
 
         town, held_out = self.town, self._held_out(results)
         counts = held_out.shares["counted"]
         used = np.flatnonzero(np.isfinite(counts).any(axis=(1, 2)))
         if not used.size:
-            if len(held_out.days) == sum(len(cell.items) for cell in self.cells()):
-                raise InputError(
-                    f"{town.counts.source}: no car park is counted both on days followed and on days held out, want "
-                    "--from others"
-                )
-            return {"rows": []}
+            if len(held_out.days) < sum(len(cell.items) for cell in self.cells()):
+                return {"rows": []}
+            raise InputError(
+                f"{town.counts.source}: no car park is counted both on days followed and on days held out, want "
+                "--from others"
+            )
         errors = {name: np.abs(held_out.shares[name] - counts) for name in PREDICTIONS}
         errors["fit"] = np.where(np.isfinite(counts), held_out.fit_error, np.nan)
         weeks = np.unique((held_out.days - held_out.days[0]) // 7, return_inverse=True)[1]
@@ -228,19 +211,17 @@ class DemandStudy(Study):
         rows: list[Row] = []
         for number in used.tolist():
             known = np.isfinite(counts[number])
-            rows.append(
-                {
-                    "car_park": town.names[number],
-                    "capacity": int(town.capacity[number]),
-                    "arrivals_a_day": float(come[number]),
-                    "stay_h": float(stay_h[number]),
-                    "map_weight": float(town.map_weight[number]),
-                    "days_held_out": int(known.any(axis=1).sum()),
-                    "counted": float(counts[number][known].mean()),
-                    "simulated": float(held_out.shares["simulated"][number][known].mean()),
-                    **_errors({name: error[[number]] for name, error in errors.items()}, weeks),
-                }
-            )
+            row = {
+                "car_park": town.names[number],
+                "capacity": int(town.capacity[number]),
+                "arrivals_a_day": float(come[number]),
+                "stay_h": float(stay_h[number]),
+                "map_weight": float(town.map_weight[number]),
+                "days_held_out": int(known.any(axis=1).sum()),
+                "counted": float(counts[number][known].mean()),
+                "simulated": float(held_out.shares["simulated"][number][known].mean()),
+            }
+            rows.append(row | _errors({name: error[[number]] for name, error in errors.items()}, weeks))
         correlation = spearmanr(town.map_weight[used], come[used]).statistic if len(used) > 2 else None
         return {
             "rows": rows,
@@ -253,13 +234,11 @@ class DemandStudy(Study):
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
         off = [row["car_park"] for row in summary["rows"] if row["simulated_error"] > FAR_OFF]
-        findings = [
-            f"{plural(summary['days_held_out'], 'day')} held out; error {summary['simulated_error']:.1%}."
+        lists = {"Not followed": off, "Not in the lot": summary["not_in_lot"]}
+        return [
+            f"{plural(summary['days_held_out'], 'day')} held out; error {summary['simulated_error']:.1%}.",
+            *(f"{what}: {', '.join(names)}." for what, names in lists.items() if names),
         ]
-        findings += [f"Not followed: {', '.join(off)}."] if off else []
-        return findings + (
-            [f"Not in the lot: {', '.join(summary['not_in_lot'])}."] if summary["not_in_lot"] else []
-        )
 
     def _held_out(self, results: Results) -> HeldOutErrors:
         town, rows, fits = self.town, results.rows(DAYS), results.rows(FITTED)
@@ -284,39 +263,32 @@ class DemandStudy(Study):
         from parkenv.show.figures.fleet import CarParkDays, save_counted_demand
 
         town, held_out, fits = self.town, self._held_out(result.results), result.results.rows(FITTED)
-        last = self.roll_outs - 1
-        fitted = {kind: parks for kind in KINDS if (parks := fits[last, kind]["car_parks"])}
+        last, first_kind = self.roll_outs - 1, None
         predictions = list(result.results.rows(DAYS).values())
         tasks: list[Task[object]] = [partial(_write_predictions, predictions, result.folder)]
-        for kind, car_parks in fitted.items():
-            demand = self.scenario.demand | {name: fit["purpose"] for name, fit in car_parks.items()}
-            scenario = self.scenario.changed(demand=demand)
-            tasks.append(partial(scenario.write, result.folder / f"{kind}.json"))
-        if not fitted:
+        for kind in KINDS:
+            if car_parks := fits[last, kind]["car_parks"]:
+                demand = self.scenario.demand | {name: fit["purpose"] for name, fit in car_parks.items()}
+                scenario = self.scenario.changed(demand=demand)
+                tasks.append(partial(scenario.write, result.folder / f"{kind}.json"))
+                first_kind = first_kind or kind
+        if first_kind is None:
             return tasks  # nothing was counted in the last weeks
-        weekdays = KINDS[next(iter(fitted))]
         shown = np.isin(held_out.days, self.days(last)[1])
-        shown &= np.isin(town.counts.weekday[held_out.days], weekdays)
+        shown &= np.isin(town.counts.weekday[held_out.days], KINDS[first_kind])
         cars = {name: of[:, shown] * town.capacity[:, None, None] for name, of in held_out.shares.items()}
-        car_park_days = [
-            CarParkDays(
-                town.names[k],
-                town.capacity[k],
-                np.nanmean(cars["simulated"][k], axis=0),
-                cars["mean_followed"][k][0],
-                cars["counted"][k],
-            )
-            for k in np.flatnonzero(np.isfinite(cars["counted"]).any(axis=(1, 2)))
-        ]
+        car_park_days = []
+        for k in np.flatnonzero(np.isfinite(cars["counted"]).any(axis=(1, 2))):
+            simulated, followed = np.nanmean(cars["simulated"][k], axis=0), cars["mean_followed"][k][0]
+            of_park = town.names[k], town.capacity[k], simulated, followed, cars["counted"][k]
+            car_park_days.append(CarParkDays(*of_park))
         hours = town.hours.astype(np.float64) + 1.0
         return [*tasks, partial(save_counted_demand, car_park_days, hours, result.folder / "demand.png")]
 
 
-class HeldOutErrors(NamedTuple):
-    """Finished days held out: n car parks on d days; NaN: unknown."""
-
+class HeldOutErrors(NamedTuple):  # finished days: n car parks on d days; NaN: unknown
     days: IntArray  # (d,) indices into the days of the counts
-    shares: dict[str, FloatArray]  # (n, d, n_hours) by column of `PREDICTED`
+    shares: dict[str, FloatArray]  # (n, d, n_hours), `counted` and `PREDICTIONS`
     fit_error: FloatArray  # (n, d, n_hours), share of the places that the fit is off, of the weeks before
     come: FloatArray  # (n, d), cars that come on such a day, by the fit
     stay_h: FloatArray  # (n, d), their mean stay

@@ -1,20 +1,28 @@
-"""Agents that drive the cars of a fleet, and its demand."""
+"""Agents that drive the cars of a fleet, its demand, and its days as a log that single searches replay."""
 
 from __future__ import annotations
 
-import signal
-import threading
+import csv
+import gzip
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from types import FrameType
+from datetime import datetime, timedelta
+from io import StringIO
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.network import NetworkPolicy
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.scenarios.build import build
+from parkenv.scenarios.spec import SAME_SLOTS, ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.setting import COUNTED, GIVEN, times_demanded
-from parkenv.studies.interruption import unsafe_to_raise
+from parkenv.studies.study import Progress
 from parkenv.world.demand import (
     ConstantTime,
     Demand,
@@ -31,8 +39,6 @@ from planners.heuristics import POLICIES
 from planners.heuristics.agents import TargetAgent
 from planners.model_file import LearnedAgent
 from planners.names import EXPECTS_RIVALS
-
-_WITHOUT_NETWORK_POLICY = ("recurrent-ppo",)
 
 
 def policy_of(
@@ -53,7 +59,7 @@ def policy_of(
         return agent.compiled_policy(), None
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
-    if isinstance(agent, LearnedAgent) and agent.card.algorithm not in _WITHOUT_NETWORK_POLICY:
+    if isinstance(agent, LearnedAgent) and agent.card.algorithm != "recurrent-ppo":
         sampled = agent.card.algorithm != "dqn"
         return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     if isinstance(agent, LearnedAgent) or not scenario.has_rules:
@@ -94,14 +100,11 @@ def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
 
 
 class AgentsByStay:
-    """An agent in Python for each car of a fleet, which plans with what the car's own stay costs."""
-
     def __init__(self, spec: AgentSpec, scenario: Scenario, known: Mapping[str, Any]) -> None:
         self._spec, self._scenario, self._options = spec, scenario, {**known, **spec.options}
 
     def predict(self, observation: Any, state: Any = None) -> tuple[Any, Any]:
-        """Return the action of the car's agent, which is made at its first decision, and the next state."""
-        if state is None:
+        if state is None:  # the car's first decision
             *driver, walks = observation["driver"]
             own = self._scenario.of_driver(Drivers(*driver), walks)
             state = make_agent(self._spec.name, own, **self._options), None
@@ -113,17 +116,10 @@ class AgentsByStay:
 def demand_in(
     scenario: Scenario, per_hour: float | str, stay_s: float, patience_s: float
 ) -> Demand | TownDemand:
-    """Return the demand of a number of cars an hour in the hours of a scenario.
+    """Return the demand of a number of cars an hour, see `rate_of`, in the hours of a scenario.
 
-    Args:
-        scenario: its hours of arrival are meant.
-        per_hour: cars an hour; of a scenario with a demand of its own, in the mean over its hours, for the purposes
-            that it has. Or `given`: that demand; `counted`: as many as make the lot as full as it is in the scenario's
-            world; or so many times the demand of a scenario that has one, and else of the counted one, such as `1.2x`.
-        stay_s: mean of the exponentially distributed stays, s, unless the scenario has a demand.
-        patience_s: search time after which a car goes elsewhere, s, unless the scenario has a demand.
-
-    In a lot with weights, cars choose entries and goals by these; else they go to the scenario's goal.
+    A number is the mean over the hours of all purposes that a scenario has. Without a demand of its own, stays, s, are
+    exponential; in a lot with weights, cars choose entries and goals by these, else they go to the scenario's goal.
     """
     window, own = scenario.arrival, scenario.demand
     if window.end_s <= window.start_s:
@@ -148,55 +144,82 @@ def demand_in(
     return Demand(arrivals, stay, ConstantTime(patience_s), entry_weights=entries, goal_weights=goals)
 
 
-_RETRY_S = 0.05  # time until the signal is sent again if raising an exception was not safe, s
+# Days of a fleet have no date; in a log the first is in this week, the next one a week later.
+FIRST_MONDAY = datetime(2024, 1, 1)
+_BEFORE_S = 1  # between the last observation of a state and the next state
 
 
-class LimitedAgent:
-    """An agent whose decisions raise an error after a time.
+def record_days(
+    spec: ScenarioSpec,
+    path: Path,
+    *,
+    agent: AgentSpec,
+    days: int,
+    rounds: int,
+    seed: int,
+    progress: Progress = lambda *_: None,
+) -> int:
+    """Drive days of a scenario's own demand, and write which slots are taken as a log; return its number of lines.
 
-    The error comes from a timer's signal, which Python handles between two of its instructions. So compiled code that
-    never returns is not stopped.
+    A counted facility is taken while it is full. Of the rounds of days the last one is recorded: drivers expect a
+    typical week in the first, and then what the days of the round before were like.
     """
+    occupancy: object = "typical"
+    for number in range(rounds):
+        scenario = build(spec.changed(occupancy=occupancy))
+        if scenario.demand is None:
+            raise InputError(f"{spec.source}: has no demand, want tables such as [demand.shoppers]")
+        policy = compiled_policy_of(agent, scenario)
+        fleet = Fleet(scenario, scenario.demand, drivers=[DriverKind(policy=policy)], leave_full_lot=False)
+        lines = []
+        for day in range(days):
+            fleet.reset(seed, day)
+            fleet.run()
+            midnight = FIRST_MONDAY + timedelta(weeks=day, days=fleet.day.weekday)
+            lines += [
+                ((midnight + timedelta(seconds=second)).isoformat(), scenario.lot.slot_ids[slot], int(taken))
+                for slot, second, taken in observations(fleet)
+            ]
+            progress("Days", number * days + day + 1, rounds * days)
+        text = StringIO()
+        csv.writer(text, lineterminator="\n").writerows([("datetime", "slot_id", "occupied"), *lines])
+        content = text.getvalue().encode()
+        with atomic_write(path) as beside:
+            # Without the time of writing, so that equal days make equal files.
+            beside.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+        occupancy = {"log": str(path), "mapping": SAME_SLOTS}
+    return len(lines)
 
-    def __init__(self, agent: Any, limit_s: float) -> None:
-        main = threading.current_thread() is threading.main_thread()
-        if not hasattr(signal, "setitimer") or not main:
-            where = "this thread" if hasattr(signal, "setitimer") else "this operating system"
-            raise InputError(f"--decision-limit needs a timer signal, which {where} does not get")
-        self._agent, self._limit_s = agent, limit_s
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._agent, name)
-
-    def predict(self, observation: Any, state: Any = None) -> tuple[Any, Any]:
-        """Return the agent's action and its next state.
-
-        Raises:
-            TimeoutError: the agent took longer than its limit.
-        """
-        with _raising_after(self._limit_s):
-            action, state = self._agent.predict(observation, state)
-        return action, state
-
-
-@contextmanager
-def _raising_after(limit_s: float) -> Iterator[None]:
-    def stop(number: int, frame: FrameType | None) -> None:
-        del number
-        if unsafe_to_raise(frame):
-            signal.setitimer(signal.ITIMER_REAL, _RETRY_S)
-            return
-        signal.setitimer(signal.ITIMER_REAL, limit_s)  # once more, for an agent that catches the error
-        raise TimeoutError(f"no decision within {limit_s:g} s")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    try:
-        try:
-            signal.setitimer(signal.ITIMER_REAL, limit_s)
-            yield
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-    finally:
-        # The signal may have come just before the timer was stopped.
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+def observations(fleet: Fleet) -> Iterator[tuple[int, int, bool]]:
+    # Slot, second of the day and whether it is taken, by slot and time, of a day whose searches are over.
+    lot, window = fleet.scenario.lot, fleet.scenario.arrival
+    midnight = fleet.begin - window.start_s
+    cars = fleet.cars[fleet.cars["slot"] >= 0]
+    came, left = cars["ended_at"] - midnight, cars["ended_at"] + cars["stay_s"] - midnight
+    slot = np.concatenate([cars["slot"], cars["slot"]]).astype(np.int64)
+    second = np.ceil(np.concatenate([came, left])).astype(np.float64)
+    change = np.repeat([1, -1], len(cars))
+    # A car that leaves makes room before another one comes.
+    order = np.lexsort((change, second, slot))
+    slot, second, change = slot[order], second[order], change[order]
+    begin, end = int(window.start_s), int(window.end_s)
+    first: NDArray[np.int64] = np.searchsorted(slot, np.arange(lot.n_slots + 1))
+    for number in range(lot.n_slots):
+        rows = slice(first[number], first[number + 1])
+        times, cars_there = second[rows], np.cumsum(change[rows])
+        full = cars_there >= lot.capacity[number]
+        at_begin = np.searchsorted(times, begin, side="right")
+        state = bool(full[at_begin - 1]) if at_begin else False
+        yield number, begin, state
+        last = begin
+        for moment, now in zip(times[at_begin:].tolist(), full[at_begin:].tolist(), strict=True):
+            if moment >= end:
+                break
+            if now != state:
+                if moment - _BEFORE_S > last:
+                    yield number, int(moment) - _BEFORE_S, state
+                yield number, int(moment), now
+                state, last = now, int(moment)
+        if last < end - 1:
+            yield number, end - 1, state
