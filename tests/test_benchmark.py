@@ -1,13 +1,13 @@
 """The benchmark suite: results can be checked, and altered ones are rejected."""
 
 import json
-import re
 from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from command_line import parkenv
+from test_report import data_of
 
 from parkenv import InputError
 from parkenv.lots import read_lot
@@ -15,9 +15,17 @@ from parkenv.lots.draft import combined_error_probability, read_provenance
 from parkenv.lots.lot_files import PLACES
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark.page import Entry, precision
-from parkenv.studies.benchmark.result_file import check_result, fingerprint, result_of, write_result
-from parkenv.studies.benchmark.suite import CONTROLS, Stratum, Suite, worlds_of
-from parkenv.studies.lots.census import slots_by_kind
+from parkenv.studies.benchmark.suite import (
+    CONTROLS,
+    Stratum,
+    Suite,
+    check_result,
+    fingerprint,
+    result_of,
+    worlds_of,
+    write_result,
+)
+from parkenv.studies.lots import check_drivability, lot_columns
 from parkenv.studies.results import EPISODES
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival
@@ -29,11 +37,9 @@ AGENTS = ("first-free", "greedy-goal")
 def small():
     """The suite with fewer searches and tasks, so that a test may run it."""
     suite = Suite.packaged()
-    tasks = [
-        replace(task, strata=tuple(replace(part, seeds=part.seeds[:2]) for part in task.strata))
-        for task in suite.tasks[3:5]
-    ]
-    return replace(suite, tasks=tuple(tasks))
+    parts = [[replace(part, seeds=part.seeds[:2]) for part in task.strata] for task in suite.tasks]
+    tasks = [replace(task, strata=tuple(strata)) for task, strata in zip(suite.tasks, parts, strict=True)]
+    return replace(suite, tasks=tuple(tasks[3:5]))
 
 
 def episodes_of(cells):
@@ -52,13 +58,10 @@ def checked(content, small, path, monkeypatch):
     return check_result(path / "result.json")
 
 
-def test_a_result_passes_its_own_check_and_scores_are_shares_of_the_bound(
-    result, small, tmp_path, monkeypatch
-):
+def test_a_result_passes_its_own_check_and_scores_are_shares(result, small, tmp_path, monkeypatch):
     assert checked(result, small, tmp_path, monkeypatch) == json.loads(json.dumps(result))
-    assert {(r["agent"], r["task"]) for r in result["rows"]} == {
-        (agent, task.name) for agent in AGENTS for task in small.tasks
-    }
+    cases = {(agent, task.name) for agent in AGENTS for task in small.tasks}
+    assert {(row["agent"], row["task"]) for row in result["rows"]} == cases
     for row in result["rows"]:
         strata = next(task.strata for task in small.tasks if task.name == row["task"])
         bound = sum(part.share * part.means[0] for part in strata)
@@ -70,33 +73,20 @@ def test_a_result_passes_its_own_check_and_scores_are_shares_of_the_bound(
 TIMES = "episodes.first-free.mini.total_s"
 
 
-def slower(content):
-    content["episodes"]["first-free"]["mini"]["total_s"][2] += 1.0
-
-
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        (
-            lambda c: times_of(c).__setitem__(0, 1.0),
-            rf"{TIMES}\[0\] is 1, want at least the clairvoyant bound",
-        ),
-        (lambda c: times_of(c).pop(), f"{TIMES} is 11, want 12 searches"),
+        (lambda c: times_of(c).__setitem__(0, 1.0), rf"{TIMES}\[0\] is 1, want at least the clairvoyant"),
+        (lambda c: times_of(c).pop(), f"{TIMES} is 11, want 12"),
         (lambda c: c["rows"].pop(), "rows has none of greedy-goal in campus-full, want one"),
         (lambda c: c["rows"].append(c["rows"][0] | {"agent": "x"}), "rows or scores are of others than"),
         (lambda c: c["episodes"]["first-free"].pop("mini"), f"{TIMES} is 0, want 12"),
-        (
-            lambda c: c["rows"][0].update(total_s=20.0),
-            r"rows\[0\].total_s is 20.0, want \d+\.\d+, of the searches of",
-        ),
-        (lambda c: c["rows"][0].update(episodes=60), r"rows\[0\].episodes is 60, want 12 searches"),
-        (slower, r"rows\[0\].total_s is"),
-        (
-            lambda c: c["rows"][0].update(decision_ms=0.0),
-            "sha256 is [0-9a-f]{64}, want [0-9a-f]{64}, the hash",
-        ),
+        (lambda c: c["rows"][0].update(total_s=20.0), r"rows\[0\].total_s is 20.0, want \d+\.\d+"),
+        (lambda c: c["rows"][0].update(episodes=60), r"rows\[0\].episodes is 60, want 12"),
+        (lambda c: times_of(c).__setitem__(2, times_of(c)[2] + 1.0), r"rows\[0\].total_s is"),
+        (lambda c: c["rows"][0].update(decision_ms=0.0), "sha256 is [0-9a-f]{64}, want [0-9a-f]{64}"),
         (lambda c: c["scores"].update({"greedy-goal": 0.99}), "scores.greedy-goal is 0.99, want"),
-        (lambda c: c.update(suite_sha256="0" * 64), "suite_sha256 is 0{64}, want .*, that of suite v3"),
+        (lambda c: c.update(suite_sha256="0" * 64), "suite_sha256 is 0{64}, want "),
         (lambda c: c.update(suite="v7"), "suite is 'v7', want 'v3'"),
         (lambda c: c.pop("scores"), "scores is missing"),
     ],
@@ -140,11 +130,8 @@ def test_precision_is_the_error_of_the_mean_difference_by_strata(small):
     parts = (Stratum(0.25, (0, 1, 2), (30.0, 0.5)), Stratum(0.75, (3, 4), (30.0, 0.5)))
     suite = replace(small, tasks=(replace(mini, strata=parts),))
     others = np.array([20.0, 20.0, 20.0, 40.0, 40.0])
-    one, other = (
-        Entry("a", {}, {"mini": others + np.array([1, 2, 3, 4, 8])}),
-        Entry("b", {}, {"mini": others}),
-    )
-    row = precision(suite, one, other)
+    times = others + np.array([1, 2, 3, 4, 8]), others
+    row = precision(suite, *(Entry(name, {}, {"mini": of}) for name, of in zip("ab", times, strict=True)))
     assert row["behind_s"] == pytest.approx(0.25 * 2.0 + 0.75 * 6.0)
     assert row["error"] == pytest.approx(np.sqrt(0.25**2 * 1.0 / 3 + 0.75**2 * 8.0 / 2))
     assert row["searches_for_1_s"] == pytest.approx(5 * (1.96 * row["error"]) ** 2, rel=1e-3)
@@ -160,10 +147,10 @@ def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, 
     page = tmp_path / "page.html"
     made = parkenv("benchmark", "page", tmp_path, "--out", page)
     assert (made.returncode, "4 agents in 2 results" in made.stdout) == (0, True), made.stderr
-    data = json.loads(re.search(r'id="report-data">(.*?)</script>', page.read_text(), flags=re.DOTALL)[1])
+    data = data_of(page)
     tables = {table["name"]: table for table in data["tables"]}
-    scores, commands, tasks = tables["scores"], tables["commands"], tables["tasks"]
-    rows = [dict(zip([c["key"] for c in scores["columns"]], row, strict=True)) for row in scores["rows"]]
+    columns = [column["key"] for column in tables["scores"]["columns"]]
+    rows = [dict(zip(columns, row, strict=True)) for row in tables["scores"]["rows"]]
     assert {row["agent"]: row["score"][0] for row in rows} == pytest.approx(result["scores"], abs=1e-4)
     assert [row["score"] for row in rows] == sorted((row["score"] for row in rows), reverse=True)
     assert all(low < score < high for score, low, high in (row["score"] for row in rows))
@@ -171,8 +158,9 @@ def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, 
     assert all(row["behind_s"][0] >= 0.0 for row in rows)
     assert {row["by"] for row in rows} == {"", "</script><b>"}
     assert {row["date"] for row in rows} == {result["date"]}
-    assert "parkenv run 'a b'" in [row[1] for row in commands["rows"]]
-    assert len(tasks["rows"]) == 2 * len(result["rows"])
+    assert "parkenv run 'a b'" in [row[1] for row in tables["commands"]["rows"]]
+    assert len(tables["tasks"]["rows"]) == 2 * len(result["rows"])
+    assert len(tables["times"]["rows"]) == 4
     page.unlink()
     unknown = json.loads(json.dumps(theirs).replace("first-free", "my_agents:Own"))
     unknown["sha256"] = fingerprint(unknown)
@@ -203,12 +191,11 @@ def test_the_suite_does_not_change_and_is_a_stratified_sample():
 
 
 def test_the_days_of_the_suite_differ_from_their_forecast():
-    suite = Suite.packaged()
-    sizes = {}
+    suite, sizes = Suite.packaged(), {}
     for task in suite.tasks:
-        made = task.made(suite.arrival)
-        sizes[task.name] = made.occupancy.day_error
-        assert made.forecast(Arrival(9 * 3600.0)).day_error == made.occupancy.day_error
+        scenario = task.made(suite.arrival)
+        sizes[task.name] = scenario.occupancy.day_error
+        assert scenario.forecast(Arrival(9 * 3600.0)).day_error == scenario.occupancy.day_error
     assert sizes["campus"] == sizes["jam"] == sizes["campus-full"] == DayError(0.8)
     assert (sizes["campus-slope"], sizes["campus-as-forecast"]) == (DayError(0.6, 0.6), DayError())
 
@@ -221,10 +208,9 @@ def test_the_places_are_sure_real_lots_of_stated_kinds():
         assert origin.source.startswith("zuid-holland_")
         assert combined_error_probability(origin.issues) <= 0.3
         assert lot.slot_ids[0].startswith(("way/", "relation/"))
-        kind, share = max(slots_by_kind(lot).items(), key=lambda one: one[1])
-        size = "small" if lot.n_slots < 80 else "medium" if lot.n_slots < 200 else "large"
-        kind = kind if share >= 0.9 * lot.n_slots else "mixed"
-        groups[f"{kind}, {size}" if kind == "perpendicular" else kind] += 1
+        row = lot_columns(lot, check_drivability(lot, origin.issues))
+        kind = row["kind"]
+        groups[f"{kind}, {row['size']}" if kind == "perpendicular" else kind] += 1
     assert groups == {
         "perpendicular, small": 4, "perpendicular, medium": 4, "perpendicular, large": 4,
         "oblique": 2, "kerbside": 4, "mixed": 6,

@@ -27,14 +27,13 @@ def spec(**changes):
         "scenarios": ["mini"],
         "agents": ["belief", "first-free"],
         "maps": ["empty"],
-        "days": 6,
+        "days": 4,
         "drivers": 1,
     }
     return Commute.parse(small | {"jobs": 1} | changes, "test")
 
 
 def write_log(path, days):
-    """A log of slots that stay as they are on a day."""
     lines = ["slot_id,datetime,occupied"]
     for day, taken in days.items():
         lines += [
@@ -44,13 +43,18 @@ def write_log(path, days):
     return path
 
 
-def test_the_command_writes_rows_maps_picture_and_report(tmp_path):
-    out = tmp_path / "run"
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    out = tmp_path_factory.mktemp("commute")
     done = ran(
         "commute", "--scenario", "mini", "--map", "empty,wrong", "--agents", "belief,first-free", "--days", 4,
         "--drivers", 2, "--out", out, "--jobs", 1, "--report",
     )  # fmt: skip
     assert "days 1-4" in done.stdout
+    return out
+
+
+def test_the_command_writes_rows_maps_picture_and_report(out):
     rows = summary_of(out)["rows"]
     cases = {("empty", "belief"), ("wrong", "belief"), ("fixed", "belief"), ("none", "first-free")}
     days = {(*case, day) for case in cases for day in range(1, 5)}
@@ -74,18 +78,18 @@ def test_the_command_writes_rows_maps_picture_and_report(tmp_path):
 
 def test_a_resumed_commute_equals_an_unbroken_one(tmp_path):
     """Also after a crash between trips and episodes, and with more days than at first."""
-    run(spec(), tmp_path / "whole")
-    run(spec(days=4), tmp_path / "broken")
-    # The last day's episodes are lost, its trips are not.
-    change_rows(tmp_path / "broken", lambda row: (row["day_number"], row["agent"]) == (4, "belief"))
-    run(spec(), tmp_path / "broken", resume=True)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
+    run(spec(), whole)
+    run(spec(days=3), broken)
+    # The last day's episodes are lost, its trips are not.
+    change_rows(broken, lambda row: (row["day_number"], row["agent"]) == (3, "belief"))
+    run(spec(), broken, resume=True)
     assert (whole / "episodes.csv").read_text() == (broken / "episodes.csv").read_text()
     assert summary_of(whole) == summary_of(broken)
     lot = make_scenario("mini").lot
     for file in (whole / "maps").iterdir():
         with MapStore(file, lot) as one, MapStore(broken / "maps" / file.name, lot) as other:
-            assert [t.key for t in one.trips()] == [f"{day:05}-0000" for day in range(1, 7)]
+            assert [t.key for t in one.trips()] == [f"{day:05}-0000" for day in range(1, 5)]
             for trip, again in zip(one.trips(), other.trips(), strict=True):
                 np.testing.assert_array_equal(trip.taken, again.taken)
     with pytest.raises(InputError, match="fleet was 1"):
@@ -117,19 +121,15 @@ def test_drivers_come_on_the_next_weekdays_or_recorded_days(tmp_path):
     recorded = mini.replace(occupancy=log, arrival=ArrivalWindow())
     days = calendar(recorded, 30)
     assert [(day.count, day.date) for day in days] == [
-        (1, dates[0]),
-        (2, dates[1]),
-        (8, dates[3]),
-        (9, dates[4]),
+        (n, dates[i]) for n, i in ((1, 0), (2, 1), (8, 3), (9, 4))
     ]
     rows = CommuteRun(recorded, AgentSpec(name="first-free"), "none", 0, 1, 0).run(days)
     assert [row["day"] for row in rows] == [day.date for day in days]
 
 
-def test_a_map_of_a_commute_is_a_forecast(tmp_path):
+def test_a_map_of_a_commute_is_a_forecast(out, tmp_path):
     """A scenario file takes the map file of a course; a copy of it goes on learning elsewhere."""
-    run(spec(maps=["wrong"], agents=["belief"], drivers=1), tmp_path / "run")
-    shutil.copy(tmp_path / "run" / "maps" / "mini_wrong_belief_0.sqlite", tmp_path / "map.sqlite")
+    shutil.copy(out / "maps" / "mini_wrong_belief_0.sqlite", tmp_path / "map.sqlite")
     Path(tmp_path / "known.toml").write_text('lot = "mini"\nforecast = "map.sqlite"\n')
     known = make_scenario(tmp_path / "known.toml")
     arrival = known.occupancy.draw_arrival(known.arrival, np.uint64(1))

@@ -11,14 +11,17 @@ from parkenv.lots import grid_lot, import_lot, packaged_lot, write_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.scenarios.build import largest_lots
 from parkenv.scenarios.spec import scenario_specs
-from parkenv.studies.lots.census import COLUMNS, count_lot, longest_drive_m, lot_columns, lot_files
+from parkenv.studies.lots import COLUMNS, check_drivability, count_lot, lot_columns, lot_files
 
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)
 
 
+def columns_of(lot):
+    return lot_columns(lot, check_drivability(lot))
+
+
 @pytest.fixture
 def lots(tmp_path):
-    """A folder of three lots."""
     folder = tmp_path / "lots"
     folder.mkdir()
     for name, lot in (("b", grid_lot(2, 5)), ("a", grid_lot(4, 30)), ("mini", packaged_lot("mini"))):
@@ -38,26 +41,21 @@ def lots(tmp_path):
 )
 def test_lots_are_of_the_kind_of_their_slots(tmp_path, rows, kind):
     lot = import_lot(write(tmp_path / "made.geojson", document(rows)), AUTO).lot()
-    found = lot_columns(lot, drive=False)
-    assert (found["kind"], found["slots"]) == (kind, lot.n_slots)
-    assert sum(found[name] for name in ("perpendicular", "oblique", "kerbside")) == lot.n_slots
+    row = columns_of(lot)
+    assert (row["kind"], row["slots"]) == (kind, lot.n_slots)
+    assert sum(row[name] for name in ("perpendicular", "oblique", "kerbside")) == lot.n_slots
 
 
 def test_the_drive_is_that_to_the_farthest_slot():
-    lot = grid_lot(2, 30)
-    assert longest_drive_m(lot) == pytest.approx(79.75), (
-        "30 slots of 2.5 m, 3 m from the entry, and across the lane"
-    )
-    found = lot_columns(lot, drive=False)
-    assert found["drive_s"] == pytest.approx(longest_drive_m(lot) * 0.36, abs=0.06)
-    assert [lot_columns(grid_lot(2, n), drive=False)["size"] for n in (39, 40, 99, 100)] == [
-        "small", "medium", "medium", "large",
-    ]  # fmt: skip
+    # 30 slots of 2.5 m, 3 m from the entry, and across the lane.
+    assert columns_of(grid_lot(2, 30))["drive_s"] == pytest.approx(79.75 * 0.36, abs=0.06)
+    sizes = [columns_of(grid_lot(2, n))["size"] for n in (39, 40, 99, 100)]
+    assert sizes == ["small", "medium", "medium", "large"]
 
 
 def test_a_census_is_a_table_and_pictures(lots, tmp_path):
     out = tmp_path / "census"
-    done = ran("lot census --no-drive --out", out, lots)
+    done = ran("lot census --out", out, lots)
     assert "3 lots, 140 slots: 3 clean" in done.stdout
     assert sorted(path.name for path in out.iterdir()) == [
         "census.csv", "census.png", "contact-sheet-1.png", "summary.json",
@@ -73,7 +71,7 @@ def test_a_census_is_a_table_and_pictures(lots, tmp_path):
 
 def test_what_is_no_lot_is_named_and_the_others_are_counted(lots, tmp_path):
     (lots / "broken.geojson").write_text('{"type": "FeatureCollection", "features": [')
-    done = parkenv("lot", "census", lots, "--no-drive", "--out", tmp_path / "census")
+    done = parkenv("lot", "census", lots, "--out", tmp_path / "census")
     assert (done.returncode, "3 clean, 1 invalid" in done.stdout) == (2, True)
     rows = summary_of(tmp_path / "census")["rows"]
     assert [row["result"] for row in rows] == ["clean"] * 3 + ["invalid"]

@@ -16,14 +16,13 @@ from made_outlines import document, double_row, kerb, row, town, write
 from pictures import shows_color
 from small_lots import features
 
-from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import ImportOptions, Provenance, read_provenance
 from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.spaces import spaces_from_outlines
 from parkenv.show.colors import PALETTE
-from parkenv.studies.lots.drivability import ManoeuvreKind, can_park, check_drivability
+from parkenv.studies.lots import check_drivability
 from parkenv.world.lot import Lane, ParkingLot
 
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)
@@ -321,48 +320,24 @@ class TestExtracts:
 
 
 class TestSurvey:
-    CAR = VehicleParameters()
-
-    def test_manoeuvres_that_a_driver_would_do_and_not(self):
-        assert can_park(ManoeuvreKind(90, 600, 250, 500), self.CAR)
-        assert can_park(ManoeuvreKind(0, 350, 210, 600), self.CAR)
-        assert not can_park(ManoeuvreKind(90, 600, 180, 500), self.CAR)
-        assert not can_park(ManoeuvreKind(90, 225, 250, 500), self.CAR)
-        assert not can_park(ManoeuvreKind(0, 600, 210, 440), self.CAR)
-
     @pytest.mark.parametrize("name", ["mini", "campus", "street"])
     def test_packaged_lots_are_clean(self, name):
         survey = check_drivability(packaged_lot(name))
         assert survey.problems == ()
         assert survey.error_probability == 0.0
-        assert survey.planned == survey.kinds
 
     def test_one_way_lanes_without_a_loop(self):
         mini = packaged_lot("mini")
         lot = ParkingLot(**{**features(mini), "lanes": (Lane(mini.lanes[0].points, oneway=True),)})
-        assert any("form no loop" in p.message for p in check_drivability(lot, drive=False).problems)
+        assert any("form no loop" in p.message for p in check_drivability(lot).problems)
 
     def test_a_lane_over_a_slot(self):
         mini = packaged_lot("mini")
         over = Lane(np.array([mini.lanes[0].points[1], mini.slot_xy[0]]))
         lot = ParkingLot(**{**features(mini), "lanes": (*mini.lanes, over)})
-        survey = check_drivability(lot, drive=False)
+        survey = check_drivability(lot)
         assert any("leaves less than 1 m to the slot" in p.message for p in survey.problems)
         assert survey.error_probability >= 0.5
-
-    def test_a_slot_too_narrow_to_drive_into_is_named(self, tmp_path):
-        mini = packaged_lot("mini")
-        width = mini.slot_width.copy()
-        width[3] = 1.7
-        lot = ParkingLot(**{**features(mini), "slot_width": width})
-        path = tmp_path / "lot.geojson"
-        write_lot(lot, path)
-        said = parkenv("lot", "check", path).stdout
-        assert "the car gets into no slots of 5 × 1.7 m at 90°" in said
-        assert f"1 slots ('{mini.slot_ids[3]}')" in said
-        assert "error probability 0.2" in said
-        undriven = parkenv("lot", "check", path, "--no-drive")
-        assert (undriven.returncode, "gets into no" in undriven.stdout) == (0, False)
 
 
 class TestTown:

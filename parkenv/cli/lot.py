@@ -86,7 +86,7 @@ class Show(Command):
 
 
 class Check(Command):
-    """The check of drivability: can a car reach every slot, drive into it and get back, and are lanes clear?
+    """The check of drivability: can a car reach every slot and get back, and are lanes clear?
 
     The error probability, 0 to 1, summarises the reasons why an imported lot may differ from the place. The output
     describes a valid lot.
@@ -100,12 +100,11 @@ class Check(Command):
         """
 
     place: Place
-    drive: bool = option(True, "Plan how the car drives into each kind of slot.")
 
     def run(self) -> None:
         from parkenv.lots import check_lot, read_lot
         from parkenv.lots.lot_files import lot_format
-        from parkenv.studies.lots.drivability import check_drivability
+        from parkenv.studies.lots import check_drivability
 
         console = make_console(soft_wrap=True)
         problems, form, drivability = check_lot(self.place), lot_format(self.place), None
@@ -114,7 +113,7 @@ class Check(Command):
             with warnings.catch_warnings(action="ignore"):  # listed already
                 lot = read_lot(self.place)
             issues = origin.issues if origin is not None else ()
-            drivability = check_drivability(lot, issues, drive=self.drive)
+            drivability = check_drivability(lot, issues)
             problems += drivability.problems
         for problem in problems:
             feature = "" if problem.feature is None else f"feature {problem.feature}: "
@@ -127,8 +126,6 @@ class Check(Command):
             raise Exit(2)
         if drivability is not None:
             console.print(_summary(lot))
-            if self.drive:
-                console.print(f"{drivability.planned} of {drivability.kinds} kinds of manoeuvres planned")
             reasons = f": {'; '.join(map(str, drivability.issues))}" if drivability.issues else ""
             console.print(f"error probability {drivability.error_probability:.2f}{reasons}")
 
@@ -329,18 +326,18 @@ class Import(Command):
 
     def _import_car_parks(self) -> None:
         from parkenv.files.atomic_write import write_together
-        from parkenv.studies.lots.town_import import import_town_lots
+        from parkenv.studies.lots import import_town_lots
 
         console = make_console(soft_wrap=True)
         with stages(console) as progress, write_together(self.out) as folder:
-            town = import_town_lots(self.place, folder, self._options, self.least, progress)
-            save_summary(folder, None, town.rows)
-        print_rows(make_console(), "Car parks", town.rows, columns=_LOT_COLUMNS)
-        results = Counter(row["result"] for row in town.rows)
+            rows = import_town_lots(self.place, folder, self._options, self.least, progress)
+            save_summary(folder, None, rows)
+        print_rows(make_console(), "Car parks", rows, columns=_LOT_COLUMNS)
+        results = Counter(row["result"] for row in rows)
         listed = ", ".join(f"{results[name]} {name}" for name in ("clean", "warnings", "refused"))
-        lots = plural(len(town.rows) - results["refused"], "lot")
+        lots = plural(len(rows) - results["refused"], "lot")
         console.print(
-            f"{plural(len(town.rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}"
+            f"{plural(len(rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}"
         )
 
 
@@ -357,13 +354,12 @@ class Census(Command):
     examples = """
         parkenv lot import town.geojson --split --out lots
         parkenv lot census lots
-        parkenv lot census campus.geojson lots --no-drive --out results/all
+        parkenv lot census campus.geojson lots --out results/all
         """
 
     places: Several[Path] = option(
         ..., "Lots (.geojson, .yml), and folders of lots (.geojson).", takes="FILE|DIR", argument=True
     )
-    drive: bool = option(True, "Plan how the car drives into each kind of slot, as `parkenv lot check` does.")
     out: Path = option(
         Path("results/census"),
         "Folder for census.csv, summary.json, census.png and contact sheets.",
@@ -371,10 +367,10 @@ class Census(Command):
     )
 
     def run(self) -> None:
-        from parkenv.studies.lots.census import take_census
+        from parkenv.studies.lots import take_census
 
         with stages(make_console(soft_wrap=True), "lots") as progress:
-            rows = take_census(self.places, self.out, drive=self.drive, progress=progress)
+            rows = take_census(self.places, self.out, progress=progress)
         save_summary(self.out, None, rows)
         print_rows(make_console(), "Lots", rows, [column.key for column in _LOT_COLUMNS], _LOT_COLUMNS)
         results, slots = Counter(row["result"] for row in rows), sum(row.get("slots", 0) for row in rows)

@@ -26,37 +26,15 @@ from parkenv.world.week import DAY_S, HOUR_S
 
 
 class FitReport(NamedTuple):
-    """Results of a fit or an evaluation.
-
-    Attributes:
-        title: name of the data.
-        summary: content of `summary.json`; `rows` is its table.
-        notes: faults of the data, and what the rows leave out.
-    """
-
-    title: str
-    summary: Row
-    notes: Sequence[str] = ()
+    title: str  # name of the data
+    summary: Row  # content of `summary.json`; `rows` is its table
+    notes: Sequence[str] = ()  # faults of the data, and what the rows leave out
 
 
 def fit(log: Path, folder: Path, *, max_gap_s: float, timezone: str, progress: Progress) -> FitReport:
-    """Fit a model to a log of slots, or to counts of car parks.
-
-    Args:
-        log: the log or the counts.
-        folder: where files go.
-        max_gap_s: observations of a log that are farther apart are not linked, s.
-        timezone: local time zone of counts in UTC.
-        progress: called as steps and days are finished.
-    """
     if is_counts(log):
         return _fit_counts(Counts.read(log, timezone), progress)
     progress("Fitting rates", 0, 0)
-    return _fit_log(log, folder, max_gap_s)
-
-
-def _fit_log(log: Path, folder: Path, max_gap_s: float) -> FitReport:
-    """Fit arrival and departure rates to a log of slots; write process.json and rates.png."""
     fitted = fit_process(OccupancyLog.read(log), max_gap_s=max_gap_s)
     process = fitted.process
     process.to_file(folder / "process.json")
@@ -72,15 +50,15 @@ def _fit_log(log: Path, folder: Path, max_gap_s: float) -> FitReport:
         for name, day in (("weekday", 0), ("weekend", 5))
         for hour in range(7, 19)
     ]
-    counts = {"log_likelihood": fitted.log_likelihood, "intervals": fitted.n_intervals}
+    summary = {"rows": rows, "log_likelihood": fitted.log_likelihood, "intervals": fitted.n_intervals}
+    summary["day_error"] = asdict(process.day_error)
     title = f"{log.name}: {plural(len(fitted.slot_ids), 'slot')}, {plural(fitted.n_intervals, 'interval')}"
-    summary = {"rows": rows, **counts, "day_error": asdict(process.day_error)}
     note = f"Days differ from the process by a standard deviation of {process.day_error.level:.2f} logits"
     return FitReport(title, summary, [note])
 
 
 def _fit_counts(counts: Counts, progress: Progress) -> FitReport:
-    """Estimate by how much days of whole car parks differ from their forecasts, and the typical week."""
+    # By how much days of whole car parks differ from their forecasts, and the typical week.
     n = len(counts.days)
     settings = fit_settings(counts, n, counted(progress, "Fit", FIT_STEPS))
     forecast = forecast_days(counts, 0, "rolling", settings, lambda day: progress("Forecast days", day, n))
@@ -129,28 +107,10 @@ def evaluate(
     seed: int,
     progress: Progress,
 ) -> FitReport:
-    """Score forecasts of counts of car parks, or of a log of slots; draw a picture of each model.
-
-    Args:
-        log: the counts or the log.
-        folder: where the pictures go.
-        from_day: first day that is scored; None: halfway.
-        car_parks: those of the counts that are scored; None for all.
-        timezone: local time zone of counts in UTC.
-        seed: seed of the bootstrap.
-        progress: called as steps, days and models are finished.
-    """
     if not is_counts(log):
         return _evaluate_log(log, folder, from_day, seed, progress)
     counts = Counts.read(log, timezone)
     counts = counts if car_parks is None else counts.chosen(list(car_parks))
-    return _evaluate_counts(counts, folder, from_day, seed, progress)
-
-
-def _evaluate_counts(
-    counts: Counts, folder: Path, from_day: date | None, seed: int, progress: Progress
-) -> FitReport:
-    """Score forecasts of car parks, each day from the days before it."""
     n = len(counts.days)
     first = n // 2 if from_day is None else counts.day_index(from_day)
     if not np.isfinite(counts.occupied[:, first:]).any():
@@ -172,12 +132,10 @@ def _evaluate_counts(
         "idle": counts.idle(),
         "variances": asdict(settings),
     }
-    title = _scored(rows[0], plural(rows[0]["car_parks"], "car park"), summary)
-    return FitReport(title, summary, _faults(counts))
+    return _scored(plural(rows[0]["car_parks"], "car park"), summary, _faults(counts))
 
 
 def _evaluate_log(log: Path, folder: Path, from_day: date | None, seed: int, progress: Progress) -> FitReport:
-    """Score forecasts of every slot of a log in each half-hour."""
     recorded = OccupancyLog.read(log)
     first = recorded.days[len(recorded.days) // 2] if from_day is None else str(from_day)
     classes = [np.flatnonzero(recorded.weekend == weekend) for weekend in (False, True)]
@@ -189,16 +147,15 @@ def _evaluate_log(log: Path, folder: Path, from_day: date | None, seed: int, pro
     for compared in models:
         save_forecast(shown_slots(compared, log.name), folder / f"{compared.model}.png")
     rows = [_row(compared, models[0], seed) for compared in models]
-    summary = {"rows": rows, "first_day": first}
-    return FitReport(_scored(rows[0], plural(len(recorded.slot_ids), "slot"), summary), summary)
+    return _scored(plural(len(recorded.slot_ids), "slot"), {"rows": rows, "first_day": first})
 
 
-def _scored(row: Row, what: str, summary: Row) -> str:
-    return f"{what}, {plural(row['days'], 'day')} from {summary['first_day']}"
+def _scored(what: str, summary: Row, notes: Sequence[str] = ()) -> FitReport:
+    days = plural(summary["rows"][0]["days"], "day")
+    return FitReport(f"{what}, {days} from {summary['first_day']}", summary, notes)
 
 
 def _row(compared: Compared | ComparedSlots, ours: Compared | ComparedSlots, seed: int) -> Row:
-    """Return the row of a model in the summary; differences are to `ours`."""
     scores = compared.scores
     difference = scores.log_loss_beyond(ours.scores, np.random.default_rng(seed))
     return {

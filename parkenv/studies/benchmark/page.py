@@ -16,17 +16,16 @@ from parkenv.errors import InputError
 from parkenv.show.columns import Column, shared
 from parkenv.show.report.page import Page, page_data
 from parkenv.show.report.tables import table_of
-from parkenv.studies.benchmark.study import RESULT, Benchmark
+from parkenv.studies.benchmark.study import RESULT, Benchmark, score_table
 from parkenv.studies.benchmark.suite import Suite, mean_time, score_interval
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of
 from parkenv.version import __version__
 from planners.names import AGENTS
 
+# What the address of an agent's code begins with: elsewhere, or a path in the repository of parkenv.
 ADDRESSES = ("http", "examples/", "docs/leaderboard/")
-"""What the address of an agent's code begins with: elsewhere, or a path in the repository of parkenv."""
-PAIRS = 5
-"""Pairs of neighbours whose precision is shown."""
+PAIRS = 5  # pairs of neighbours whose precision is shown
 _WIDE = float(ndtri(0.975))
 _WHO = (
     Column("by", "submitted by"),
@@ -37,7 +36,6 @@ _WHO = (
 
 
 def result_files(path: Path) -> list[Path]:
-    """Return the result files in a folder: each `result.json` below it, or else each `.json`; a file is itself."""
     if not path.is_dir():
         return [path]
     if not (files := sorted(path.rglob(RESULT)) or sorted(path.rglob("*.json"))):
@@ -46,30 +44,21 @@ def result_files(path: Path) -> list[Path]:
 
 
 class Entry(NamedTuple):
-    """An agent of a result file."""
-
     agent: str
     result: Row
     times: Mapping[str, FloatArray]  # total time of each search, s, by task
 
-    @property
-    def rows(self) -> list[Row]:
-        """Its rows, one for each task."""
-        return [row for row in self.result["rows"] if row["agent"] == self.agent]
-
     def minus(self, other: Entry) -> dict[str, FloatArray]:
-        """Return the paired differences of the times, s, by task."""
-        return {task: its - other.times[task] for task, its in self.times.items()}
+        return {task: times - other.times[task] for task, times in self.times.items()}
 
 
 def entries_of(results: Sequence[Row]) -> list[Entry]:
-    """Return the agents of results, the best score first."""
     entries = []
     for result in results:
         for agent, tasks in result["episodes"].items():
             if agent.partition("(")[0] not in AGENTS and not result["code"].startswith(ADDRESSES):
                 raise InputError(f"code is {result['code']!r}, want the address of the code of {agent}")
-            times = {task: np.array(its["total_s"]) for task, its in tasks.items()}
+            times = {task: np.array(searches["total_s"]) for task, searches in tasks.items()}
             entries.append(Entry(agent, result, times))
     return sorted(entries, key=lambda entry: -entry.result["scores"][entry.agent])
 
@@ -81,18 +70,16 @@ def ranking(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
     and regression on the few wild searches of a stratum makes their intervals too short.
     """
     best = next((entry for entry in entries if entry.agent != "oracle"), entries[0])
-    return [
-        {
-            "agent": entry.agent,
-            **columns_of("score", score_interval(suite, entry.times)),
-            **columns_of("mean_s", mean_time(suite, entry.times).interval()),
-            **columns_of("behind_s", mean_time(suite, entry.minus(best), controls=False).interval()),
-            "decision_ms": float(np.mean([row["decision_ms"] for row in entry.rows])),
-            "searches": sum(row["episodes"] for row in entry.rows),
-            **_origin(entry.result),
-        }
-        for entry in entries
-    ]
+    rows = []
+    for entry in entries:
+        of_tasks = [row for row in entry.result["rows"] if row["agent"] == entry.agent]
+        row = {"agent": entry.agent, **columns_of("score", score_interval(suite, entry.times))}
+        row |= columns_of("mean_s", mean_time(suite, entry.times).interval())
+        row |= columns_of("behind_s", mean_time(suite, entry.minus(best), controls=False).interval())
+        row["decision_ms"] = float(np.mean([row["decision_ms"] for row in of_tasks]))
+        row["searches"] = sum(row["episodes"] for row in of_tasks)
+        rows.append(row | _origin(entry.result))
+    return rows
 
 
 def _origin(result: Row) -> Row:
@@ -115,44 +102,34 @@ def precision(suite: Suite, one: Entry, other: Entry) -> Row:
 
 
 def neighbours(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
-    """Return the `precision` of neighbours in the ranking, of the first `PAIRS`, the oracle apart."""
+    # The `precision` of the first in the ranking, the oracle apart.
     rivals = [entry for entry in entries if entry.agent != "oracle"][: PAIRS + 1]
     return [precision(suite, worse, better) for better, worse in itertools.pairwise(rivals)]
 
 
 def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, Any]:
-    """Build the data of a page, the best score first."""
     suite, entries = Suite.packaged(), entries_of(results)
-    times = [
-        {"agent": entry.agent}
-        | {f"{row['task']}{end}": row[f"total_s{end}"] for row in entry.rows for end in ("", "_ci95")}
-        for entry in entries
-    ]
-    origins = [
+    commands = [
         {"agent": ", ".join(result["episodes"]), "command": shlex.join(result["command"])} | _origin(result)
         for result in results
     ]
-    in_tasks = [Column(task.name, task.name, "s", help=_TIMES) for task in suite.tasks]
+    in_tasks = [row for result in results for row in result["rows"]]
     tables = [
         table_of("scores", "Ranking", ranking(suite, entries), _COLUMNS),
-        table_of("times", "Mean total time in each task", times, in_tasks),
+        {**score_table(results), "name": "times"},
         table_of("pairs", "How many searches tell neighbours apart", neighbours(suite, entries), _COLUMNS),
-        table_of("commands", "How the results were made", origins, _COLUMNS),
-        table_of(
-            "tasks", "Every task", [row for result in results for row in result["rows"]], Benchmark.columns
-        ),
+        table_of("commands", "How the results were made", commands, _COLUMNS),
+        table_of("tasks", "Every task", in_tasks, Benchmark.columns),
     ]
     summary = {"command": command, "version": __version__, "seed": None}
     return page_data("benchmark", Page(f"Benchmark suite {suite.name}", [suite.description], tables), summary)
 
 
-_TIMES = "Mean total time, 95 % interval"
-_SCORE = "Mean time of the clairvoyant bound over the agent's; 95 % interval"
 _BEHIND = "Mean time minus that of the best, or of the second agent, in the same worlds; 95 % interval"
 _COLUMNS = (
     *shared("agent"),
     Column("agents", "agents"),
-    Column("score", "score", share=True, help=_SCORE),
+    Benchmark.columns[-1],
     Column("mean_s", "mean time", "s", help="Over the tasks, each with the same weight; 95 % interval"),
     Column("behind_s", "behind", "s", 2, signed=True, help=_BEHIND),
     *shared("decision_ms"),

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from parkenv.files.limited_reading import read_json
 from parkenv.files.option import option
 from parkenv.show.columns import Column, shared
+from parkenv.show.report.tables import spread, table_of
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import CaseStudy
 from parkenv.studies.fields import Agents
@@ -27,9 +28,6 @@ AGENTS = ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-go
 
 
 def score_table(results: Sequence[Row]) -> Row:
-    """Return the table of the scores of results, the best first."""
-    from parkenv.show.report.tables import spread, table_of
-
     rows = [
         {**row, "score": result["scores"][row["agent"]]}
         for result in results
@@ -74,7 +72,6 @@ class Benchmark(CaseStudy):
 
     @cached_property
     def made_suite(self) -> Suite:
-        """The suite."""
         from parkenv.studies.benchmark.suite import Suite
 
         return Suite.packaged()
@@ -100,22 +97,16 @@ class Benchmark(CaseStudy):
         return self.made_suite.cases(self.agents)
 
     def summarise(self, results: Results) -> Row:
-        from parkenv.studies.benchmark.result_file import score_rows
+        from parkenv.studies.benchmark.suite import score_rows
 
         return {"rows": score_rows(self.made_suite, self.cells(), results.rows(self.table))}
 
     @classmethod
     def printed(cls, summary: Row, folder: Path) -> list[Row]:
-        """See `Study`: the scores of a finished suite."""
         return [score_table([read_json(folder / RESULT)])] if summary["complete"] else []
 
-    @classmethod
-    def folder(cls, given: Mapping[str, Any]) -> Path:
-        return Path("results") / str(given.get("SUITE", "v3"))
-
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: the result file."""
-        from parkenv.studies.benchmark.result_file import result_of, write_result
+        from parkenv.studies.benchmark.suite import result_of, write_result
 
         finished = result.results.rows(self.table)
         command = result.summary["command"]

@@ -12,40 +12,49 @@ arrival are known for the whole population, and serve as control variates.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import re
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field, TypeAdapter
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import write_text
+from parkenv.files.field_types import NotNegative, Probability
 from parkenv.files.limited_reading import read_json
+from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, at_occupancy, require_distinct
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.statistics import Estimate, stratified_estimate
+from parkenv.studies.results import Key, Row, decision_s, without_nan
+from parkenv.studies.statistics import Estimate, columns_of, decision_columns, stratified_estimate
 from parkenv.studies.study import Cell
+from parkenv.version import __version__
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from planners.agent import make_agent
 
+# Columns of an episode that its world alone determines: the control variates.
 CONTROLS = ("bound_s", "occupancy")
-"""Columns of an episode that its world alone determines: the control variates."""
 _FILE = Path(__file__).parent / "suites" / "v3.json"
 
 
 @dataclass(frozen=True)
 class Stratum:
-    """A part of the population of a task's worlds, such as its full days."""
-
     share: float  # in the population
     seeds: tuple[int, ...]  # the searches
     means: tuple[float, ...]  # of `CONTROLS`, over the part's whole population
@@ -53,9 +62,7 @@ class Stratum:
 
 @dataclass(frozen=True)
 class Task:
-    """One scenario of a suite."""
-
-    name: str  # name of the task
+    name: str
     scenario: str  # a packaged scenario
     day_error: tuple[float, ...]  # how far days differ from the forecast, logits: (level,) or (level, slope)
     strata: tuple[Stratum, ...]  # parts of the population
@@ -66,25 +73,25 @@ class Task:
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """The seeds of the searches."""
         return tuple(seed for part in self.strata for seed in part.seeds)
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
-        """Make the scenario, named after the task."""
-        days = DayError(*self.day_error)
-        made = make_scenario(self.scenario, name=self.name, arrival=arrival, day_error=days)
+        options: dict[str, Any] = {
+            "name": self.name,
+            "arrival": arrival,
+            "day_error": DayError(*self.day_error),
+        }
         if self.sensor_model != "perfect":
-            made = made.replace(sensor_model=SensorModel.named(self.sensor_model))
+            options["sensor_model"] = SensorModel.named(self.sensor_model)
         if self.v_walk_kmh is not None:
-            made = made.replace(v_walk=self.v_walk_kmh * KMH)
-        return made if self.occupancy_level is None else at_occupancy(made, self.occupancy_level)
+            options["v_walk"] = self.v_walk_kmh * KMH
+        scenario = make_scenario(self.scenario, **options)
+        return scenario if self.occupancy_level is None else at_occupancy(scenario, self.occupancy_level)
 
 
 @dataclass(frozen=True)
 class Suite:
-    """A benchmark suite."""
-
-    name: str  # name, such as v3
+    name: str
     description: str  # one sentence
     arrival: ArrivalWindow  # when searches begin
     tasks: tuple[Task, ...]
@@ -100,16 +107,12 @@ class Suite:
             ('v3', 'campus', 3000)
         """
         content = read_json(_FILE)
-        return cls(
-            content["name"],
-            content["description"],
-            ArrivalWindow.parse(content["arrival"], content["days"]),
-            tuple(_task(**task) for task in content["tasks"]),
-            sha256_of(content),
-        )
+        fields = [{"sensor_model": task.get("sight", "perfect")} | task for task in content["tasks"]]
+        tasks = TypeAdapter(tuple[Task, ...]).validate_python(fields)
+        arrival = ArrivalWindow.parse(content["arrival"], content["days"])
+        return cls(content["name"], content["description"], arrival, tasks, sha256_of(content))
 
     def cases(self, agents: Sequence[AgentSpec]) -> list[Cell]:
-        """Return the cases: every agent in every task."""
         worlds = [task.made(self.arrival) for task in self.tasks]
         for world in worlds:
             for agent in agents:
@@ -123,38 +126,14 @@ class Suite:
         return cells
 
 
-def _task(
-    strata: Sequence[Mapping[str, Any]], day_error: Sequence[float], sight: str = "perfect", **fields: Any
-) -> Task:
-    """Return a task of a suite's file."""
-    parts = tuple(Stratum(each["share"], tuple(each["seeds"]), tuple(each["means"])) for each in strata)
-    return Task(sensor_model=sight, day_error=tuple(day_error), strata=parts, **fields)
-
-
 def estimate(task: Task, values: ArrayLike, worlds: FloatArray, *, controls: bool = True) -> Estimate:
-    """Estimate the mean of a number over a task's worlds.
-
-    Args:
-        task: the task.
-        values: (n,) the number in each search, in the order of the task's seeds.
-        worlds: (n, 2) `CONTROLS` of each search.
-        controls: whether to use them as control variates.
-    """
+    """Estimate the mean of a number over a task's worlds, from its (n,) `values`, in the order of the task's seeds."""
     numbers = np.repeat(np.arange(len(task.strata)), [len(part.seeds) for part in task.strata])
     shares, means = [part.share for part in task.strata], [part.means for part in task.strata]
-    if not controls:
-        return stratified_estimate(values, numbers, shares)
-    return stratified_estimate(values, numbers, shares, worlds, means)
+    return stratified_estimate(values, numbers, shares, *((worlds, means) if controls else ()))
 
 
 def mean_time(suite: Suite, times: Mapping[str, ArrayLike], *, controls: bool = True) -> Estimate:
-    """Estimate the mean over the tasks of a suite of times, or of paired differences of two agents, s.
-
-    Args:
-        suite: the suite.
-        times: (n,) s, those of each search, by task.
-        controls: see `estimate`.
-    """
     return Estimate.combined(
         (1.0 / len(suite.tasks), estimate(task, times[task.name], worlds_of(task, suite), controls=controls))
         for task in suite.tasks
@@ -162,26 +141,12 @@ def mean_time(suite: Suite, times: Mapping[str, ArrayLike], *, controls: bool = 
 
 
 def score_of(task: Task, total: FloatArray, worlds: FloatArray) -> float:
-    """Return an agent's score in a task: the mean of the clairvoyant bound over that of its total times.
-
-    The former is known for the whole population.
-
-    Args:
-        task: the task.
-        total: (n,) total time of each search, s.
-        worlds: (n, 2) `CONTROLS` of each search.
-    """
     bound = sum(part.share * part.means[0] for part in task.strata)
     return min(1.0, bound / estimate(task, total, worlds).mean)
 
 
 def score_interval(suite: Suite, times: Mapping[str, FloatArray]) -> tuple[float, float, float]:
-    """Return an agent's score in a suite and its 95 % interval (delta method).
-
-    Args:
-        suite: the suite.
-        times: (n,) s, those of each search, by task.
-    """
+    """Return an agent's score in a suite and its 95 % interval (delta method)."""
     scores, slopes = [], {}
     for task in suite.tasks:
         total, worlds = times[task.name], worlds_of(task, suite)
@@ -192,16 +157,192 @@ def score_interval(suite: Suite, times: Mapping[str, FloatArray]) -> tuple[float
 
 @functools.cache
 def worlds_of(task: Task, suite: Suite) -> FloatArray:
-    """Return the `CONTROLS` of a task's searches, (n, 2)."""
-    return controls_of(task.made(suite.arrival), task.seeds)
-
-
-def controls_of(scenario: Scenario, seeds: Sequence[int]) -> FloatArray:
-    """Return the `CONTROLS` of the worlds of seeds, (n, 2)."""
+    scenario = task.made(suite.arrival)
     runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario))
-    return np.array([(runner.bound_s(seed), runner.occupancy) for seed in seeds])
+    return np.array([(runner.bound_s(seed), runner.occupancy) for seed in task.seeds])
 
 
 def sha256_of(content: Any) -> str:
-    """Return the SHA-256 of a content, as JSON without white space."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+RESULT_VERSION = 2
+_ROUNDED = 1e-3  # s; times are written to 1 ms
+Ends = Annotated[tuple[float | None, float | None], Field(strict=False)]
+
+
+class _ResultRow(Spec, extra="allow"):
+    task: str
+    agent: str
+    episodes: int = Field(ge=1)
+    parked_fraction: Probability
+    total_s: float
+    total_s_ci95: Ends
+    regret_s: float
+    regret_s_ci95: Ends
+    failed_parks: float
+    decision_ms: float
+    decision_ms_p99: float
+    score: Probability
+
+
+# Metrics of an agent in a task, named as in `parkenv compare`; a result also has the score.
+METRICS = tuple(_ResultRow.model_fields)[2:-1]
+
+
+class ResultFile(Spec):
+    format: Literal["parkenv-benchmark-result"]
+    version: Literal[2]
+    suite: Literal["v3"]
+    suite_sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    parkenv: str
+    commit: str = Field(max_length=60)
+    command: Several[str]
+    by: str = Field(max_length=200)
+    code: str = Field(max_length=200)
+    date: str = Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}$")
+    rows: Several[_ResultRow] = Field(min_length=1)
+    scores: dict[str, Probability]
+    episodes: dict[
+        str, dict[str, dict[Literal["total_s"], Several[NotNegative]]]
+    ]  # in the order of the seeds
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+def score_rows(
+    suite: Suite, cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]
+) -> list[Row]:
+    tasks, rows = {task.name: task for task in suite.tasks}, []
+    for case, seeds in cells:
+        task = tasks[case.scenario.name]
+        searches = [finished[key] for seed in seeds if (key := case.key(seed)) in finished]
+        if len(searches) < len(seeds):
+            continue
+        total = np.array([search["total_s"] for search in searches])
+        worlds = np.array([[search[name] for name in CONTROLS] for search in searches])
+        row = _estimates(task, total, worlds) | {"episodes": len(searches)}
+        row |= decision_columns([time for search in searches for time in decision_s(search)])
+        for name in ("parked", "failed_parks"):
+            values = [float(search[name]) for search in searches]
+            row[name] = estimate(task, values, worlds, controls=False).mean
+        row["parked_fraction"] = min(row["parked"], 1.0)
+        metrics = {name: row.get(name) for name in (*METRICS, "score")}
+        rows.append({"task": task.name, "agent": case.label, **metrics})
+    return rows
+
+
+def result_of(
+    suite: Suite,
+    cells: Sequence[tuple[Case, Sequence[int]]],
+    finished: Mapping[Key, Row],
+    command: Sequence[str],
+    by: str = "",
+    code: str = "",
+) -> Row:
+    """Build the content of a result file from finished cases.
+
+    The `finished` are the rows of all episodes of all cases, by `Case.key`. Who submits it (`by`) and the address of
+    the agents' `code` are dated today.
+    """
+    rows = score_rows(suite, cells, finished)
+    scores: dict[str, list[float]] = {}
+    for row in rows:
+        scores.setdefault(row["agent"], []).append(row["score"])
+    episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for case, seeds in cells:
+        times = [round(finished[case.key(s)]["total_s"], 3) for s in seeds]
+        episodes.setdefault(case.label, {})[case.scenario.name] = {"total_s": times}
+    content: Row = without_nan(
+        {
+            "format": "parkenv-benchmark-result",
+            "version": RESULT_VERSION,
+            "suite": suite.name,
+            "suite_sha256": suite.fingerprint,
+            "parkenv": __version__,
+            "commit": source_commit(),
+            "command": list(command),
+            "by": by,
+            "code": code,
+            "date": datetime.now(UTC).date().isoformat(),
+            "rows": rows,
+            "scores": {agent: float(np.mean(of_tasks)) for agent, of_tasks in scores.items()},
+            "episodes": episodes,
+        }
+    )
+    return {**content, "sha256": fingerprint(content)}
+
+
+def write_result(folder: Path, content: Row, name: str) -> None:
+    text = json.dumps(content, indent=1, allow_nan=False)
+    # The numbers of a list in one line.
+    text = re.sub(r"\[[-+.eE\d,\s]+\]", lambda numbers: " ".join(numbers[0].split()), text)
+    write_text(folder / name, text + "\n")
+
+
+def source_commit() -> str:
+    # Of this package's source, with `-dirty` if files differ from it; empty outside a repository.
+    here = Path(__file__)
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        for command in (("ls-files", "--error-unmatch", here.name), ("describe", "--always", "--dirty")):
+            git = "git", "-C", str(here.parent), *command
+            commit = subprocess.run(git, capture_output=True, text=True, check=True, timeout=20.0).stdout
+        return commit.strip()
+    return ""
+
+
+def check_result(path: Path) -> Row:
+    """Read a result file, and check that it is complete, consistent, and from the suite's own worlds.
+
+    The check recomputes the clairvoyant bounds of all searches, which differ in other worlds or with other costs and
+    speeds, and from the times of the searches all means and scores. It cannot verify the times of an agent; for that,
+    run the agent again.
+    """
+    result: Row = read_json(path)
+    ResultFile.parse(result, str(path))
+    suite = Suite.packaged()
+
+    def require(field: str, value: Any, wanted: Any) -> None:
+        # Times were rounded to 1 ms.
+        same = (
+            value == wanted
+            if isinstance(wanted, str)
+            else np.allclose(np.array(value, float), np.array(wanted, float), rtol=0.0, atol=_ROUNDED)
+        )
+        if not same:
+            raise InputError(f"{path}: {field} is {value}, want {wanted}")
+
+    require("suite_sha256", result["suite_sha256"], suite.fingerprint)
+    rows = {(row["agent"], row["task"]): (i, row) for i, row in enumerate(result["rows"])}
+    for agent, tasks in result["episodes"].items():
+        for task in suite.tasks:
+            if (agent, task.name) not in rows:
+                raise InputError(f"{path}: rows has none of {agent} in {task.name}, want one")
+            (number, row), times = rows.pop((agent, task.name)), f"episodes.{agent}.{task.name}.total_s"
+            total, worlds = np.array((tasks.get(task.name) or {}).get("total_s", ())), worlds_of(task, suite)
+            require(times, len(total), len(worlds))
+            require(f"rows[{number}].episodes", row["episodes"], len(worlds))
+            for i in np.flatnonzero(total < worlds[:, 0] - _ROUNDED):
+                bound = f"want at least the clairvoyant bound, {worlds[i, 0]:.3f}"
+                raise InputError(f"{path}: {times}[{i}] is {total[i]:g}, {bound}")
+            for name, value in _estimates(task, total, worlds).items():
+                require(f"rows[{number}].{name}", row[name], value)
+        own = [row["score"] for row in result["rows"] if row["agent"] == agent]
+        require(f"scores.{agent}", result["scores"].get(agent), float(np.mean(own)))
+    if rows or result["scores"].keys() != result["episodes"].keys():
+        raise InputError(
+            f"{path}: rows or scores are of others than {', '.join(result['episodes'])} in the tasks"
+        )
+    require("sha256", result["sha256"], fingerprint(result))
+    return result
+
+
+def _estimates(task: Task, total: FloatArray, worlds: FloatArray) -> Row:
+    return {
+        **columns_of("total_s", estimate(task, total, worlds).interval()),
+        **columns_of("regret_s", estimate(task, total - worlds[:, 0], worlds).interval()),
+        "score": score_of(task, total, worlds),
+    }
+
+
+def fingerprint(content: Row) -> str:
+    return sha256_of({key: value for key, value in content.items() if key != "sha256"})

@@ -6,10 +6,13 @@ trips of a day go into the map in the evening. All agents and maps meet the same
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,14 +22,87 @@ from parkenv.files.file_names import file_name
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap
 from parkenv.mapping.trips import Trip
 from parkenv.studies.agent_spec import AgentSpec, label_of
-from parkenv.studies.commute.tables import FIXED, NONE
 from parkenv.studies.episodes import EpisodeRunner, TripRecorder
 from parkenv.studies.results import Row, timed_row
+from parkenv.studies.statistics import columns_of, mean_interval, trimmed_mean_interval
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import PriorModel
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
+
+# Names in the column `map` of the references: a right map that does not learn; an agent that uses no map.
+FIXED, NONE = "fixed", "none"
+_Runs = dict[int, list[Row]]
+
+
+def day_rows(episodes: Sequence[Row]) -> list[Row]:
+    """Return a row per scenario, map, agent and day: mean total time and forecast error, with 95 % intervals.
+
+    The forecast error is the Brier score at the arrival, over slots. The excess is the time beyond that of the first
+    agent with the right map, which does not learn: a 10 % trimmed mean, since a full lot may add the give-up penalty to
+    one of the two. Intervals are over courses: a fleet's drivers meet the same day.
+    """
+    return [
+        {**case, "day": day, **row, **excess}
+        for case, day, row, _, excess in _periods(episodes, lambda row: row["day_number"])
+    ]
+
+
+def week_rows(episodes: Sequence[Row]) -> list[Row]:
+    """Return a row per scenario, map, agent and five days, with the paired difference to the first agent without a map.
+
+    The difference is paired by course: the same driver on the same days.
+    """
+    last = max((row["day_number"] for row in episodes), default=0)
+    weeks = _periods(episodes, lambda row: (row["day_number"] - 1) // 5 + 1)
+    return [
+        {**case, "days": f"{5 * week - 4}-{min(5 * week, last)}", **row, **difference, **excess}
+        for case, week, row, difference, excess in weeks
+    ]
+
+
+def _periods(
+    episodes: Sequence[Row], period: Callable[[Row], int]
+) -> Iterator[tuple[Row, int, Row, Row, Row]]:
+    cases: dict[Any, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    for row in episodes:
+        cases[row["scenario"], row["map"], row["agent"]][period(row)][row["course"]].append(row)
+    for case, by_period in cases.items():
+        # The first agents with these maps.
+        none, fixed = (
+            next((cases[other] for other in cases if other[:2] == (case[0], name)), dict[int, _Runs]())
+            for name in (NONE, FIXED)
+        )
+        columns = dict(zip(("scenario", "map", "agent"), case, strict=True))
+        for number, courses in sorted(by_period.items()):
+            means = {"courses": len(courses)} | _mean("total_s", courses) | _mean("forecast_error", courses)
+            difference = _difference("difference_s", courses, none.get(number, {}), mean_interval)
+            robust = partial(trimmed_mean_interval, cut=0.1)
+            excess = _difference("excess_s", courses, fixed.get(number, {}), robust)
+            yield columns, number, means, difference, excess
+
+
+def _difference(
+    name: str, courses: _Runs, reference: _Runs, interval: Callable[[Sequence[float]], Any]
+) -> Row:
+    paired = [
+        _course_mean("total_s", searches) - _course_mean("total_s", reference[course])
+        for course, searches in courses.items()
+        if len(reference.get(course, ())) == len(searches)
+    ]
+    return columns_of(name, interval(paired)) if paired else {}
+
+
+def _course_mean(name: str, episodes: Sequence[Mapping[str, Any]]) -> float:
+    return float(np.mean([np.nan if row[name] is None else row[name] for row in episodes]))
+
+
+def _mean(name: str, courses: _Runs) -> Row:
+    means = [_course_mean(name, searches) for searches in courses.values()]
+    # Agents without a map have no forecast error.
+    return columns_of(name, mean_interval(means) if np.isfinite(means).all() else (np.nan, np.nan, np.nan))
+
 
 MAPS_FOLDER = "maps"
 _COURSES_APART, _DRIVERS_APART = 1_000_000, 1_000
@@ -44,18 +120,13 @@ class Day:
 
 
 def calendar(scenario: Scenario, days: int) -> list[Day]:
-    """Return the days on which drivers come: the next weekdays, or the recorded days, of the scenario's arrivals.
-
-    A log with fewer days than wanted ends the commute early.
-    """
     occupancy, window = scenario.occupancy, scenario.arrival
     if occupancy.recorded:
         dates = sorted(occupancy.days_in(window))[:days]
         counts = [date.fromisoformat(day).toordinal() for day in dates]
         first_monday = counts[0] - date.fromisoformat(dates[0]).weekday()
         return [
-            Day(i + 1, count - first_monday, day)
-            for i, (count, day) in enumerate(zip(counts, dates, strict=True))
+            Day(i, n - first_monday, day) for i, (n, day) in enumerate(zip(counts, dates, strict=True), 1)
         ]
     weekdays = sorted(window.weekdays)
     return [Day(i + 1, 7 * (i // len(weekdays)) + weekdays[i % len(weekdays)], "") for i in range(days)]
@@ -67,8 +138,6 @@ def map_file(folder: Path, run: CommuteRun) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class CommuteRun:
-    """One driver, or a fleet that shares a map, with one agent and one map to start from."""
-
     scenario: Scenario
     agent: AgentSpec
     map: str  # empty, right, wrong, `FIXED` or `NONE`
@@ -87,9 +156,7 @@ class CommuteRun:
 
     @property
     def columns(self) -> Row:
-        return {
-            "scenario": self.scenario.name, "map": self.map, "agent": self.label, "course": self.number,
-        }  # fmt: skip
+        return {"scenario": self.scenario.name, "map": self.map, "agent": self.label, "course": self.number}
 
     def start_map(self) -> PriorModel:
         scenario = self.scenario
@@ -104,7 +171,6 @@ class CommuteRun:
         return scenario.occupancy
 
     def run(self, days: Sequence[Day]) -> list[Row]:
-        """Run some days, in order; return a row for each search, with its trip under `TRIP` if trips go into a map."""
         rows: list[Row] = []
         known = self.start_map()
         agent = make_agent(self.agent.name, self.scenario, **self.agent.options)
@@ -118,26 +184,19 @@ class CommuteRun:
                 scenario, seed = self._search(day, driver, known)
                 recorder = TripRecorder()
                 record = EpisodeRunner(scenario, self.label, agent).run(seed, (recorder,))
-                error = record.forecast - record.occupied
+                error = float(np.mean((record.forecast - record.occupied) ** 2))
                 time = day.count * DAY_S + scenario.arrival.start_s
                 trips.append(recorder.trip(f"{day.number:05}-{driver:04}", time, day.date))
-                rows.append(
-                    {
-                        **self.columns,
-                        "day_number": day.number,
-                        "driver": driver,
-                        **timed_row(record),
-                        "forecast_error": None if self.map == NONE else float(np.mean(error**2)),
-                        TRIP: trips[-1] if self.learns else None,
-                    }
-                )
+                row = {**self.columns, "day_number": day.number, "driver": driver, **timed_row(record)}
+                row["forecast_error"] = None if self.map == NONE else error
+                rows.append(row | {TRIP: trips[-1] if self.learns else None})
             if isinstance(known, LearnedMap):
                 trips.sort(key=lambda trip: (trip.time, trip.key))
                 known.learn(trips)
         return rows
 
     def _search(self, day: Day, driver: int, known: PriorModel) -> tuple[Scenario, int]:
-        """Return the scenario of a driver's search, at the same time every day, and the seed of the day's world."""
+        # A driver comes at the same time every day; the seed is that of the day's world.
         scenario = self.scenario
         first = self.seed + self.number * _COURSES_APART
         second = scenario.arrival.draw_second(world_key(first, 1 + driver))
@@ -154,6 +213,6 @@ class CommuteRun:
 
 
 def with_fixed_slots(scenario: Scenario) -> Scenario:
-    """Return a scenario in which every slot is the same one on all days of a log."""
+    # Every slot is the same one on all days of a log.
     fixed = scenario.occupancy.with_fixed_slots(scenario.arrival)
     return scenario.replace(occupancy=fixed, prior=scenario.prior and scenario.prior.for_world(fixed))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -114,8 +115,8 @@ class Commute(Study):
     @model_validator(mode="after")
     def _bounded(self) -> Self:
         require_distinct_names(self.agents, self.scenarios)
-        count = len(self.agents) * len(self.scenarios) * (len(self.maps) + 1)
-        count *= self.days * self.drivers * self.fleet
+        axes = self.agents, self.scenarios, (*self.maps, "fixed")
+        count = math.prod(map(len, axes)) * self.days * self.drivers * self.fleet
         require_at_most(count, "agents x scenarios x maps x days x drivers", "searches")
         return self
 
@@ -128,8 +129,7 @@ class Commute(Study):
 
     @cached_property
     def runs(self) -> list[CommuteRun]:
-        from parkenv.studies.commute.runs import CommuteRun
-        from parkenv.studies.commute.tables import FIXED, NONE
+        from parkenv.studies.commute.runs import FIXED, NONE, CommuteRun
         from planners.names import WITHOUT_FORECAST
 
         return [
@@ -173,10 +173,10 @@ class Commute(Study):
         return f"{work.agent.label} in {work.scenario.name}"
 
     def stages(self, results: Results) -> Iterator[Stage]:
-        """See `Study`: a block of days needs the maps of the days before."""
         from parkenv.mapping.store import MapStore
         from parkenv.studies.commute.runs import map_file
 
+        # A block of days needs the maps of the days before.
         for first in range(0, self.days, self.block):
             doing = f"{self.doing}, days {first + 1} to {min(first + self.block, self.days)}"
             cells = []
@@ -210,27 +210,26 @@ class Commute(Study):
             old.unlink()
 
     def summarise(self, results: Results) -> Row:
-        from parkenv.studies.commute.tables import day_rows, week_rows
+        from parkenv.studies.commute.runs import day_rows, week_rows
 
         episodes = [row for cell in self.cells() for row in results.of(self, cell)]
         return {"rows": day_rows(episodes), "weeks": week_rows(episodes)}
 
     @classmethod
     def printed(cls, summary: Row, folder: Path) -> list[Row]:
-        """See `Study`: mean total times and forecast errors of each five days."""
         from parkenv.show.report.tables import spread, table_of
 
         del folder
-        weeks, names = summary["weeks"], ("scenario", "map", "agent")
-        days = dict.fromkeys(row["days"] for row in weeks)
-        return [
-            table_of("weeks", title, spread(weeks, names, "days", measure), columns)
-            for title, measure, digits in (
-                ("Mean total time, s, by days", "total_s", 1),
-                ("Forecast error by days", "forecast_error", 3),
-            )
-            for columns in [(*cls.columns, *(Column(day, f"days {day}", digits=digits) for day in days))]
-        ]
+        weeks, tables = summary["weeks"], []
+        for title, measure, digits in (
+            ("Mean total time, s", "total_s", 1),
+            ("Forecast error", "forecast_error", 3),
+        ):
+            days = dict.fromkeys(row["days"] for row in weeks)
+            columns = *cls.columns, *(Column(day, f"days {day}", digits=digits) for day in days)
+            rows = spread(weeks, ("scenario", "map", "agent"), "days", measure)
+            tables.append(table_of("weeks", f"{title}, by days", rows, columns))
+        return tables
 
     def outputs(self, result: Result) -> list[Task[object]]:
         from parkenv.show.figures.times import save_commute_curves

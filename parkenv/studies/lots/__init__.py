@@ -1,1 +1,0 @@
-"""Lots under examination: whether cars can drive and park there, a census, and imports of towns."""
