@@ -5,8 +5,7 @@ from pathlib import Path
 
 from parkenv.show.plurals import interval_text
 from parkenv.studies.benchmark.page import entries_of, neighbours, ranking, result_files
-from parkenv.studies.benchmark.result_file import check_result
-from parkenv.studies.benchmark.suite import Suite
+from parkenv.studies.benchmark.suite import Suite, check_result
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "leaderboard"

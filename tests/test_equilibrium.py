@@ -18,8 +18,6 @@ LOT = grid_lot(1, 3, pitch=12.0)
 
 
 class FromSlot:
-    """Drives past the first slots, and takes the first free one from there on, in the second round any."""
-
     def __init__(self, first, world):
         del world
         self.first = first
@@ -35,7 +33,6 @@ class FromSlot:
 
 
 def scenario(p_taken, taken, v_walk):
-    """Slots that are taken or free for good; the forecast says that each is taken with the same probability."""
     occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
     logit = np.log(p_taken / (1.0 - p_taken))
     prior = OccupancyProcess.from_demand(np.full(3, logit), np.zeros(168), 600.0)
@@ -46,7 +43,6 @@ def scenario(p_taken, taken, v_walk):
 
 
 def costs(p_taken, v_walk, drivers):
-    """Return the expected total times, s, of both of two cars for each pair of drivers, (k, k, 2)."""
     total_s = np.zeros((len(drivers), len(drivers), 2))
     arrivals = ListedArrivals((8 * 3600.0, 8 * 3600.0 + 2.0))
     demand = Demand(arrivals, ConstantTime(3600.0), ConstantTime(120.0))
@@ -67,7 +63,6 @@ def costs(p_taken, v_walk, drivers):
 
 
 def equilibria(total_s):
-    """Return the pairs of pure strategies in which neither car gains by another one."""
     first, second = total_s[..., 0], total_s[..., 1]
     least = (first <= first.min(axis=0) + 1e-9) & (second <= second.min(axis=1, keepdims=True) + 1e-9)
     return [tuple(pair) for pair in np.argwhere(least)]

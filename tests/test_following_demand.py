@@ -22,13 +22,11 @@ TIMES = 86400.0 + np.arange(7 * 3600.0 + 300.0, 14.5 * 3600.0 + 1.0, 300.0)
 
 
 def steady(occupied, stay_s, n=50):
-    """A process that is always as full, whose cars stay exponentially long."""
     odds = occupied / (1.0 - occupied)
     return OccupancyProcess(np.ones(n), np.full(168, odds / stay_s), np.ones(n), np.full(168, 1.0 / stay_s))
 
 
 def expected_cars(rates, survives):
-    """M/G/oo: cars of the given rates by hour that are still there at `TIMES`, by adding up minutes."""
     arrival = np.arange(MORNING.start_s, MORNING.end_s, 60.0) + 30.0
     elapsed = (TIMES - 86400.0)[:, None] - arrival
     came = rates[(arrival // 3600).astype(int)] * 60.0 / 3600.0

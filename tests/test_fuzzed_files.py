@@ -28,8 +28,7 @@ from parkenv.scenarios.build import build
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.report.page import write_page
-from parkenv.studies.benchmark.result_file import check_result
-from parkenv.studies.benchmark.suite import Suite
+from parkenv.studies.benchmark.suite import Suite, check_result
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.fleet.tables import CHANGES
 from parkenv.studies.report import RunFolder

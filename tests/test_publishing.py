@@ -8,8 +8,7 @@ import gymnasium as gym
 import yaml
 
 import parkenv
-from parkenv.studies.benchmark.result_file import RESULT_VERSION
-from parkenv.studies.benchmark.suite import Suite
+from parkenv.studies.benchmark.suite import RESULT_VERSION, Suite
 
 ROOT = Path(__file__).parents[1]
 PAPER = (ROOT / "paper.md").read_text(encoding="utf-8")

@@ -25,8 +25,8 @@ def test_the_mean_over_the_slots_is_as_counted_at_full_hours(lot, options):
     process = real_week_occupancy(lot, **options)
     level = np.interp(options.get("fuller_than", 0.9), LEVEL_SHARES, LEVELS)
     expected = expit(logit(OCCUPIED / 100.0) + level)
-    found = np.array([process.marginal(3600.0 * (hour + 1)).mean() for hour in range(168)])
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    means = [process.marginal(3600.0 * (hour + 1)).mean() for hour in range(168)]
+    np.testing.assert_allclose(means, expected, atol=1e-4)
 
 
 def test_cars_that_stay_long_leave_later_than_the_counts_fall():
@@ -42,13 +42,14 @@ def test_a_scenario_file_says_how_full(tmp_path):
     made = make_scenario(file)
     noon = 24 * 3600.0 + 12 * 3600.0
     assert made.occupancy.marginal(noon).mean() == pytest.approx(0.64, abs=1e-4)
-    assert (
-        ScenarioSpec.parse({"lot": "mini", "occupancy": "real-week"}, "test").occupancy.real_week is not None
-    )
-    with pytest.raises(InputError, match="at most one of typical, real_week"):
-        ScenarioSpec.parse({"lot": "mini", "occupancy": {"real_week": {}, "typical": {}}}, "test")
-    with pytest.raises(InputError, match=r"occupancy\.real_week\.fuller_than is 1\.5"):
-        ScenarioSpec.parse({"lot": "mini", "occupancy": {"real_week": {"fuller_than": 1.5}}}, "test")
+    spec = ScenarioSpec.parse({"lot": "mini", "occupancy": "real-week"}, "test")
+    assert spec.occupancy.real_week is not None
+    for occupancy, message in (
+        ({"real_week": {}, "typical": {}}, "at most one of typical, real_week"),
+        ({"real_week": {"fuller_than": 1.5}}, r"occupancy\.real_week\.fuller_than is 1\.5"),
+    ):
+        with pytest.raises(InputError, match=message):
+            ScenarioSpec.parse({"lot": "mini", "occupancy": occupancy}, "test")
 
 
 def test_slots_spread_as_in_the_recorded_log():

@@ -8,7 +8,7 @@ from mkdocs.structure.files import File
 
 from parkenv.show.report.page import write_page
 from parkenv.studies.benchmark.page import benchmark_data, result_files
-from parkenv.studies.benchmark.result_file import check_result
+from parkenv.studies.benchmark.suite import check_result
 
 PAGE = "leaderboard/page.html"
 RESULTS = "docs/leaderboard/results"

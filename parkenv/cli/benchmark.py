@@ -26,7 +26,7 @@ class Check(Command):
     results: Several[Path] = option(..., "Result files.", takes="FILE", argument=True)
 
     def run(self) -> None:
-        from parkenv.studies.benchmark.result_file import check_result
+        from parkenv.studies.benchmark.suite import check_result
 
         console = make_console()
         with console.status("Checking"):
@@ -59,7 +59,7 @@ class Page(Command):
         from parkenv.files.atomic_write import make_folder
         from parkenv.show.report.page import write_page
         from parkenv.studies.benchmark.page import benchmark_data, result_files
-        from parkenv.studies.benchmark.result_file import check_result
+        from parkenv.studies.benchmark.suite import check_result
 
         files = [file for path in self.results for file in result_files(path)]
         make_folder(self.out.parent)

@@ -4,6 +4,7 @@ from functools import cache, partial
 
 import numpy as np
 from closed_forms import Statement, closed_form
+from small_lots import driven
 
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.scenarios.build import make_scenario
@@ -16,7 +17,6 @@ SCENARIOS = {"campus": 240.0, "street": 120.0, "mini": 90.0}
 
 
 def made_fleet(name):
-    """Return a fleet of three kinds of drivers, some of which balk, among cars that were parked before."""
     arrivals = PoissonArrivals(SCENARIOS[name], 8 * HOUR_S, 10 * HOUR_S)
     kinds = [DriverKind(policy=POLICIES[name]) for name in ("greedy-drive", "first-free", "random")]
     demand = Demand(arrivals, ExponentialTime(HOUR_S), ConstantTime(600.0))
@@ -25,31 +25,18 @@ def made_fleet(name):
 
 @cache
 def day(name):
-    """Return the fleet and its cars at the end of a day, two hours after the last search."""
-    fleet = made_fleet(name)
-    fleet.reset(0)
-    fleet.run()
+    fleet = driven(made_fleet(name), 0)
     fleet.run(until=fleet.time + 2 * HOUR_S)
     return fleet.cars.copy(), fleet.totals, fleet.time
 
 
-def searched_apart(name):
-    """Return the hours of search that the engine counts less those of single cars."""
-    cars, totals, _ = day(name)
-    return (totals["searching_s"] - (cars["ended_at"] - cars["arrival"]).sum()) / HOUR_S
-
-
-def parked_apart(name):
-    """Return the same of the hours in which cars are parked."""
+def hours_apart(name):
+    """Hours of search, and in which cars are parked, that the engine counts less those of single cars."""
     cars, totals, end = day(name)
     parked = cars[cars["slot"] >= 0]
-    return (totals["parked_s"] - (np.minimum(parked["left_at"], end) - parked["ended_at"]).sum()) / HOUR_S
-
-
-def unbalanced(name):
-    """Return the number of events at which cars are lost or doubled."""
-    cars, _, _ = day(name)
-    return unbalanced_events(made_fleet(name), cars)
+    searched_s = (cars["ended_at"] - cars["arrival"]).sum()
+    parked_s = (np.minimum(parked["left_at"], end) - parked["ended_at"]).sum()
+    return (totals["searching_s"] - searched_s) / HOUR_S, (totals["parked_s"] - parked_s) / HOUR_S
 
 
 def unbalanced_events(fleet, cars):
@@ -59,19 +46,18 @@ def unbalanced_events(fleet, cars):
     wrong = 0
     for time in times[np.isfinite(times)]:
         fleet.run(until=float(time))
-        now, totals = fleet.cars, fleet.totals
         due = cars["arrival"] > time
         searching = ~due & (cars["ended_at"] > time)
         parked = ~due & ~searching & (cars["slot"] >= 0) & (cars["left_at"] > time)
-        gone = ~due & ~searching & ~parked
-        counted = [totals[name] for name in ("due", "searching", "parked", "gone")]
+        groups = due, searching, parked, ~due & ~searching & ~parked
+        counted = [fleet.totals[name] for name in ("due", "searching", "parked", "gone")]
         here = fleet.slots["car"]
         standing = here[here >= 0]
         wrong += not (
-            counted == [group.sum() for group in (due, searching, parked, gone)]
+            counted == [group.sum() for group in groups]
             and sum(counted) == len(cars)
-            and len(np.unique(standing)) == len(standing) == totals["parked"]
-            and np.array_equal(now["slot"][standing], np.flatnonzero(here >= 0))
+            and len(np.unique(standing)) == len(standing) == fleet.totals["parked"]
+            and np.array_equal(fleet.cars["slot"][standing], np.flatnonzero(here >= 0))
             and fleet.time == time
         )
     return wrong
@@ -86,11 +72,14 @@ def balance():
     it runs, is the sum of the search times of single cars; the same holds for parked ones.
     """
     return [
-        Statement(f"{name}: {what}", 0.0, partial(found, name), 1e-6)
+        Statement(f"{name}: {what}", 0.0, partial(measure, name), 1e-6)
         for name in SCENARIOS
-        for what, found in (
-            ("events at which cars are lost or doubled", unbalanced),
-            ("hours of search, the engine's less those of single cars", searched_apart),
-            ("hours parked, the engine's less those of single cars", parked_apart),
+        for what, measure in (
+            (
+                "events at which cars are lost or doubled",
+                lambda name: unbalanced_events(made_fleet(name), day(name)[0]),
+            ),
+            ("hours of search, the engine's less those of single cars", lambda name: hours_apart(name)[0]),
+            ("hours parked, the engine's less those of single cars", lambda name: hours_apart(name)[1]),
         )
     ]

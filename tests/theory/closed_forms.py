@@ -20,22 +20,13 @@ ROUNDING = 1e-9
 
 
 class Statement(NamedTuple):
-    """What theory expects of a case.
-
-    Attributes:
-        case: what is compared, with its parameters.
-        expected: what theory says.
-        found: runs planners or worlds; returns a number where nothing is drawn at random, else independent samples with
-            the expected mean.
-        tolerance: difference that is allowed besides.
-        slow: whether it takes more than a few seconds.
-    """
-
-    case: str
-    expected: float
-    found: Callable[[], object]
-    tolerance: float = 0.0
-    slow: bool = False
+    case: str  # what is compared, with its parameters
+    expected: float  # what theory says
+    found: Callable[
+        [], object
+    ]  # runs planners or worlds: a number, or independent samples with the expected mean
+    tolerance: float = 0.0  # difference that is allowed besides
+    slow: bool = False  # takes more than a few seconds
 
     def interval(self):
         """Return the interval, with Student's t at the level `CONFIDENCE`, in which `expected` has to lie."""
@@ -47,14 +38,11 @@ class Statement(NamedTuple):
         return mean - half, mean + half
 
     def agrees(self):
-        """Return whether what is found is what theory expects."""
         low, high = self.interval()
         return bool(low <= self.expected <= high)
 
 
 class ClosedForm(NamedTuple):
-    """A title, the source, the derivation in Markdown and the function that returns the statements."""
-
     title: str
     source: str
     derivation: str
@@ -65,8 +53,6 @@ FORMS = list[ClosedForm]()
 
 
 def closed_form(title, source):
-    """Add a function that returns statements to `FORMS`."""
-
     def add(statements):
         FORMS.append(ClosedForm(title, source, inspect.getdoc(statements), statements))
         return statements
@@ -75,19 +61,16 @@ def closed_form(title, source):
 
 
 def all_forms():
-    """Return all forms, in the order of `MODULES`."""
     for name in MODULES:
         importlib.import_module(name)
     return sorted(FORMS, key=lambda form: MODULES.index(form.statements.__module__))
 
 
 def sections():
-    """Return the sections of the documentation's page, in Markdown."""
     return "\n".join(map(section, all_forms()))
 
 
 def section(form):
-    """Return the section of a form."""
     rows = (
         f"| {each.case} | {each.expected:.5g} | {f'± {each.tolerance:g}' if each.tolerance else ''} |"
         for each in form.statements()

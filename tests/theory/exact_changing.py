@@ -60,11 +60,9 @@ class ChangingSolution:
         assert _iterate(self.values, self.choices, free, *ways, *ends) < MOST_SWEEPS, "not converged"
 
     def expected_s(self, vertex):
-        """Return the least expected time, s, from a vertex if nothing is observed yet."""
         return float(self.values[vertex, 0])
 
     def decide(self, vertex, belief):
-        """Return the optimal action: a move, `PARK`, or `WAIT` to observe again."""
         age = np.minimum(np.rint(belief.age / self.step_s), self.memory_steps - 1).astype(np.int64)
         codes = np.where(belief.observed, 1 + age + np.where(belief.observed_free, 0, self.memory_steps), 0)
         state = int((codes * (2 * self.memory_steps + 1) ** np.arange(len(codes))).sum())
@@ -76,7 +74,6 @@ class ChangingSolution:
 def _iterate(
     values, choices, free, moves, seconds, steps, view_starts, view_slots, cost_s, give_up_s, memory_steps
 ):
-    """Solve in place by sweeps over the states that can occur; return the number of sweeps."""
     n_vertices, n_states = values.shape
     n = len(free)
     n_codes = 2 * memory_steps + 1

@@ -4,9 +4,10 @@ from functools import cache, partial
 
 from closed_forms import Statement, closed_form
 from queues import lane
+from small_lots import driven, features
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.lots.generators import Slots, grid_lot
+from parkenv.lots.generators import grid_lot
 from parkenv.world.demand import ConstantTime, Demand, Headways
 from parkenv.world.lot import ParkingLot
 from planners.heuristics import POLICIES
@@ -18,41 +19,26 @@ DRIVERS = (60, 75, 120, 150, 200)
 
 @cache
 def street():
-    """Return a lot of `PLACES` slots at the price of the street, with the cost of a failed search."""
     plain = grid_lot(2, PLACES // 2)
-    slots = Slots.of_lot(plain)
-    lot = ParkingLot(
-        name="street",
-        slot_ids=plain.slot_ids,
-        **Slots(
-            slots.xy, slots.yaw, slots.length, slots.width, slots.mouth, slots.parking_cost_s + STREET
-        ).columns(),
-        lanes=plain.lanes,
-        entries=plain.entries,
-        goals=plain.goals,
-    )
+    lot = ParkingLot(**features(plain) | {"slot_parking_cost_s": plain.slot_parking_cost_s + STREET})
     return lane(1).replace(lot=lot, occupancy=lane(lot.n_slots).occupancy, give_up_s=FAILED)
 
 
 @cache
 def competing_cost(competing):
-    """Return what all who compete for the street pay: read from a fleet of cars that drive there."""
     if competing == 0:
         return 0.0
     demand, kind = Demand(Headways(competing, 1.0), ConstantTime(float("inf"))), POLICIES["greedy-drive"]
     fleet = Fleet(street(), demand, background="none", drivers=(DriverKind(policy=kind),))
-    fleet.reset(0)
-    fleet.run()
-    return float((fleet.cars["parking_cost_s"] + fleet.cars["gave_up_s"]).sum())
+    cars = driven(fleet, 0).cars
+    return float((cars["parking_cost_s"] + cars["gave_up_s"]).sum())
 
 
 def social_cost(competing, drivers):
-    """Return what all drivers pay together."""
     return competing_cost(competing) + GARAGE * (drivers - competing)
 
 
 def equilibrium(drivers):
-    """Return how many compete once nobody gains by changing sides (best responses, from all competing on)."""
     competing = drivers
     while competing > 0 and competing_cost(competing) / competing > GARAGE + 1e-9:
         competing -= 1
@@ -61,13 +47,11 @@ def equilibrium(drivers):
 
 
 def price_of_anarchy(drivers):
-    """Return the social cost in equilibrium over the least."""
     least = min(social_cost(competing, drivers) for competing in range(drivers + 1))
     return social_cost(equilibrium(drivers), drivers) / least
 
 
 def expected_price(drivers):
-    """Return the price of anarchy of the literature."""
     selfish = PLACES * STREET + FAILED * (drivers - PLACES) if drivers <= LIMIT else GARAGE * drivers
     return selfish / (PLACES * STREET + GARAGE * (drivers - PLACES))
 

@@ -46,7 +46,6 @@ class Line:
 
     @classmethod
     def long(cls, q, ratio):
-        """Return a line whose end matters with a probability below 1e-6."""
         return cls(q, ratio, math.ceil(4.0 / (1.0 - q)), math.ceil(14.0 / (1.0 - q)))
 
     @property
@@ -55,12 +54,10 @@ class Line:
 
     @property
     def before_s(self):
-        """The cost a of a slot's distance before the goal, s."""
         return PITCH / V_WALK * (1.0 - self.ratio)
 
     @property
     def beyond_s(self):
-        """The cost b of a slot's distance beyond the goal, s."""
         return PITCH / V_WALK * (1.0 + self.ratio)
 
     @property
@@ -71,7 +68,6 @@ class Line:
 
     @property
     def mean_s(self):
-        """Mean total time, s, from the entry, one slot before the first one, with that threshold."""
         r = min(self.threshold, self.before) + 1
         a, b, free = self.before_s, self.beyond_s, 1.0 - self.q
         drive_s = (self.before + 1) * PITCH / V_WALK * self.ratio
@@ -79,7 +75,6 @@ class Line:
 
     @property
     def best_failure_s(self):
-        """A failure cost, s, with which the thesis's planner has the threshold of the line."""
         return self.before_s * (self.threshold + 0.5) * (1.0 - self.q) / self.q
 
     def mean_cost(self, takes):
@@ -91,7 +86,6 @@ class Line:
         return float((reached * chance * cost_s).sum() / (reached * chance).sum())
 
     def problem(self, slots=slice(None), rest_s=0.0):
-        """Return the search on the line, or on some of its slots, in driving order; the last one costs `rest_s`."""
         kerb_y = -ONE_WAY_HALF_WIDTH
         west, east = (self.before + 0.5) * -PITCH, (self.beyond + 0.5) * PITCH
         kerb = np.array([[west, kerb_y]]), np.array([[east, kerb_y]])
@@ -114,7 +108,6 @@ class Line:
         return SearchProblem(lot=lot, v_walk=V_WALK, v_drive=V_WALK / self.ratio, sensor_model=only_beside)
 
     def scenario(self):
-        """Return the world of this line, in which nothing changes during a search."""
         odds, problem = math.log(self.q / (1.0 - self.q)), self.problem()
         lasting = OccupancyProcess.from_demand(np.full(self.n_slots, odds), np.zeros(WEEK_HOURS), FOREVER_S)
         return Scenario(
@@ -150,7 +143,6 @@ def free_slots_taken(agent, problem, p_occupied, asked):
 
 
 def threshold_of(takes, before):
-    """Return the farthest distance before the goal at which free slots are taken; nan if a nearer one is not."""
     near = takes[: before + 1][::-1]
     count = int(near.sum())
     return float(count - 1) if near[:count].all() else math.nan
@@ -193,21 +185,16 @@ def exact_takes(line):
 
 
 def threshold(agent, line, **options):
-    """Return the threshold of an agent on a line."""
     takes = exact_takes(line) if agent == "exact" else takes_of(agent, line, **options)
     return threshold_of(takes, line.before)
 
 
 def cost_ratio(line):
-    """Return the mean cost of the rule of `belief` over that of the best rule."""
     best = np.arange(line.n_slots) >= line.before - line.threshold
     return line.mean_cost(takes_of("belief", line, day=False)) / line.mean_cost(best)
 
 
-@closed_form(
-    "Parking on a line without return",
-    "MacQueen & Miller 1960; DeGroot 1970",
-)
+@closed_form("Parking on a line without return", "MacQueen & Miller 1960; DeGroot 1970")
 def thresholds():
     r"""A car drives along a one-way lane towards its goal and past it. It sees only the slot beside it, each is taken
     with probability \(q\), independently and for good, and there is no way back. A slot \(r\) places before the goal
@@ -254,7 +241,6 @@ def thresholds():
 
 
 def total_times(name, line, seeds, **options):
-    """Return the total times, s, of searches on a line."""
     scenario = line.scenario()
     runner = EpisodeRunner(scenario, name, make_agent(name, scenario, **options))
     return [runner.run(seed).row["total_s"] for seed in seeds]
@@ -297,7 +283,6 @@ def inspections():
 
 
 def passed(free):
-    """Return the slots inspected in searches with a number of free slots."""
     seen = inspections()
     return seen[seen[:, 0] == free, 1]
 

@@ -42,7 +42,6 @@ GREEDY = POLICIES["greedy-drive"]
 
 
 def erlang_b(slots, load):
-    """Return Erlang's B: the share of arrivals that find all slots taken."""
     blocked = 1.0
     for k in range(1, slots + 1):
         blocked = load * blocked / (k + load * blocked)
@@ -50,29 +49,23 @@ def erlang_b(slots, load):
 
 
 def lane(slots):
-    """Return a lane of slots that ends at the goal: slot `slots - 1` is at the goal."""
     return Line(0.5, THESIS_SPEEDS, slots - 1, 0).scenario()
 
 
 class Run(NamedTuple):
-    """A run of a queue, with the window of time, s, in which it counts."""
-
     cars: Any
     begin: float
     end: float
 
     @property
     def since(self):
-        """The cars that arrive once the lot has filled."""
         return self.cars[self.cars["arrival"] >= self.begin]
 
     @property
     def over(self):
-        """Those of them whose search is over."""
         return self.since[self.since["ended_at"] <= self.end]
 
     def refused(self):
-        """Return the share of cars that have not parked."""
         return float(1.0 - np.isin(self.over["state"], (PARKED, LEFT)).mean())
 
     def mean_parked(self, n_slots):
@@ -85,8 +78,6 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True)
 class Queue:
-    """Independent runs of a lot that is empty at first: Poisson arrivals, `load` of them in a mean stay."""
-
     scenario: Scenario
     policy: CompiledPolicy
     load: float
@@ -96,7 +87,6 @@ class Queue:
     stay: Duration = EXPONENTIAL
 
     def samples(self, measure, seed=0):
-        """Run each world to the end of its arrivals; return what is measured in each."""
         demand = Demand(PoissonArrivals(self.load, 0.0, self.hours * HOUR_S), self.stay)
         fleet = Fleet(self.scenario, demand, background="none", drivers=(DriverKind(policy=self.policy),))
         measured = []
@@ -108,7 +98,6 @@ class Queue:
         return measured
 
     def mean_taken(self):
-        """Return the mean number of taken slots in each run."""
         n_slots = self.scenario.lot.n_slots
         return self.samples(lambda run: run.mean_parked(n_slots).sum())
 
@@ -118,9 +107,8 @@ ENTRY_SLOTS, ENTRY_LOAD = 24, 5.0  # the lot is full for one car in 10^9
 
 @cache
 def entries(policy=ORDERED_ENTRY):
-    """Return the share of time that slots are taken, the nearest first, and the mean index of a car's slot: of runs."""
     n = ENTRY_SLOTS
-    queue = Queue(lane(n), policy, ENTRY_LOAD, 100, 10.0, 400.0)
+    queue = Queue(lane(n), policy, ENTRY_LOAD, 70, 10.0, 400.0)
     found = queue.samples(lambda run: [*run.mean_parked(n)[::-1], (n - run.since["slot"]).mean()])
     return np.array(found)
 
@@ -173,9 +161,9 @@ def stays():
                 5.0,
                 small,
                 ORDERED_ENTRY,
-                Queue(lane(5), ORDERED_ENTRY, 5.0, 100, 30.0, 300.0, stay).mean_taken,
+                Queue(lane(5), ORDERED_ENTRY, 5.0, 70, 30.0, 300.0, stay).mean_taken,
             ),
-            (60, 30.0, 30.0, GREEDY, Queue(wide, GREEDY, 30.0, 15, 30.0, 100.0, stay).mean_taken),
+            (60, 30.0, 30.0, GREEDY, Queue(wide, GREEDY, 30.0, 12, 30.0, 100.0, stay).mean_taken),
         )
     ]
 
@@ -193,7 +181,7 @@ def blocking():
         Statement(
             f"10 slots, A = 8, stays {law}: cars turned away, {policy.name}",
             erlang_b(10, 8.0),
-            partial(Queue(scenario, policy, 8.0, 100, 10.0, 300.0, LAWS[law]).samples, Run.refused),
+            partial(Queue(scenario, policy, 8.0, 70, 10.0, 300.0, LAWS[law]).samples, Run.refused),
         )
         for scenario, policy, law in (
             (at_once, ORDERED_ENTRY, "exponential"),
@@ -211,7 +199,6 @@ _BEST, _OTHER = 1, 0  # what a driver of a threshold strategy notes in the field
 
 @kernel
 def decide_meek(address, number):
-    """Park right behind the most distant parked car."""
     fleet = fleet_at(address, 0)
     slots, behind = by_distance(fleet, car_at(fleet.cars, number)), fleet.n_slots
     while behind > 0 and not is_shared_slot_taken(address, slots[behind - 1], fleet.time):
@@ -221,7 +208,6 @@ def decide_meek(address, number):
 
 @inlined
 def _take_first_of_zone(address, number, zone):
-    """Take the first free slot of the zone; else the first one on the way back. Note whether it is the zone's best."""
     fleet = fleet_at(address, 0)
     car = car_at(fleet.cars, number)
     slots = by_distance(fleet, car)

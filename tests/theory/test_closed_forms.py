@@ -57,7 +57,6 @@ def test_a_statement_agrees_where_theory_is_in_its_interval():
 
 
 def best_threshold_and_cost(on):
-    """Threshold and mean cost, s, on a line, by dynamic programming from its far end."""
     onward, takes = 0.0, []
     for r in range(-on.beyond, on.before + 1):
         cost = r * on.before_s if r >= 0 else -r * on.beyond_s

@@ -20,8 +20,6 @@ from planners.routes import DriveRoutes
 
 
 class ChangingAgent(SearchAgent[None]):
-    """Follows a `ChangingSolution`, assuming that its forecast and rates are right."""
-
     name = "exact-changing"
 
     def __init__(self, solution):
@@ -38,7 +36,6 @@ class ChangingAgent(SearchAgent[None]):
 
 
 def busy(n_slots=3, stay_s=20.0, taken=(0.7, 0.85, 0.8), give_up_s=600.0):
-    """A row of slots that are observed only from their own vertex; every move takes a multiple of 2 s."""
     p = np.array(taken)
     return Scenario(
         name="busy",

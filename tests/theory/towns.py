@@ -9,6 +9,7 @@ from queues import EXPONENTIAL, Queue, Run, erlang_b, lane
 from scipy.optimize import brentq
 from scipy.sparse import diags_array, eye_array
 from scipy.sparse.linalg import spsolve
+from small_lots import driven, features
 
 from parkenv.belief.slot_belief import OBSERVED_FREE
 from parkenv.compiled.memory import record_at
@@ -44,27 +45,22 @@ LAST_S = 0.5 * HOUR_S  # of each day, in which nobody arrives
 
 
 def beside(scenario, *facilities, **changes):
-    """Return a scenario with counted facilities at its lanes, all of whose slots are free."""
-    fields = {f.name: getattr(scenario.lot, f.name) for f in dataclasses.fields(ParkingLot) if f.init}
-    lot = ParkingLot(**fields | {"facilities": facilities} | changes)
+    lot = ParkingLot(**features(scenario.lot) | {"facilities": facilities} | changes)
     return scenario.replace(lot=lot, occupancy=lane(lot.n_slots).occupancy)
 
 
 def on_lane(*garages):
-    """Return a lane with garages, given by their fields, at its first vertex."""
     xy = tuple(lane(1).lot.vertex_xy[0].tolist())
     return beside(lane(1), *(Facility(f"G{i}", "garage", xy=xy, **its) for i, its in enumerate(garages)))
 
 
 def md1_wait_s(per_hour, gate_s):
-    """Return the mean wait before a barrier, an M/D/1 queue (Pollaczek and Khinchine)."""
     rho = per_hour * gate_s / HOUR_S
     return rho * gate_s / (2.0 * (1.0 - rho))
 
 
 @kernel
 def decide_garage(address, number):
-    """Drive into the last facility at once; leave if it is full."""
     search = search_of(car_of(address, number).search)
     if search.failed_parks > 0:
         return LEAVE
@@ -99,7 +95,6 @@ _KERB = -1
 
 @kernel
 def decide_choice(address, number):
-    """Choose one of two facilities; at the kerb, drive on until a slot is free."""
     car = car_of(address, number)
     choice, search = _choice_at(policy_data(address, car), 0), search_of(car.search)
     if search.n_steps == 0:
@@ -115,8 +110,6 @@ def decide_choice(address, number):
 
 
 class ChoicePolicy(CompiledPolicy):
-    """Drivers of whom a share chooses the first of two facilities."""
-
     def __init__(self, first, second):
         super().__init__("choice", decide_choice)
         self.data = PolicyData(CHOICE, {"share": 0.5, "first": first, "second": second}, {})
@@ -200,11 +193,8 @@ def split():
     scenario = on_lane(*({"capacity": HUGE, "gate_s": gate} for gate in gates))
 
     def difference_s(share):
-        times = (
-            g + md1_wait_s(part * per_hour, g) for part, g in zip((share, 1.0 - share), gates, strict=True)
-        )
-        first_s, second_s = times
-        return first_s - second_s
+        parts = zip((share, 1.0 - share), gates, strict=True)
+        return -np.diff([gate + md1_wait_s(part * per_hour, gate) for part, gate in parts])[0]
 
     return [
         Statement(
@@ -221,7 +211,6 @@ def split():
 
 @kernel
 def decide_walk(address, number):
-    """Park in the first free slot; else take any of the lanes, all with equal probability."""
     search = search_of(car_of(address, number).search)
     if is_allowed(search, PARK) and recent_state(search, search.vertex) == OBSERVED_FREE:
         return PARK
@@ -230,7 +219,6 @@ def decide_walk(address, number):
 
 
 def walk_time_s(problem, taken):
-    """Return the mean time until a car that turns at random finds a free slot, s, from the first entry."""
     lot, neighbors = problem.lot, problem.lot.neighbors
     turns, phi = 1.0 / (neighbors >= 0).sum(axis=1), np.ones(lot.n_vertices)
     phi[: lot.n_slots] = taken
@@ -244,7 +232,6 @@ def walk_time_s(problem, taken):
 
 @cache
 def renewed(taken):
-    """Return a city, whose slots are renewed within a second."""
     lot = city_lot(400, 0)
     odds = np.full(lot.n_slots, np.log(taken / (1.0 - taken)))
     scenario = make_scenario(lot).replace(
@@ -254,14 +241,12 @@ def renewed(taken):
 
 
 def walks_s(taken, cars=1000):
-    """Return the search times of cars that turn at random, s."""
     drivers = (DriverKind(policy=CompiledPolicy("walk", decide_walk)),)
     demand = Demand(Headways(cars, 1.0), ConstantTime(1e-3))
     limits = {"max_steps": 10**6, "leave_full_lot": False}
-    fleet = Fleet(renewed(taken), demand, background="process", drivers=drivers, **limits)
-    fleet.reset(0)
-    fleet.run()
-    return fleet.cars["drive_s"]
+    return driven(Fleet(renewed(taken), demand, background="process", drivers=drivers, **limits), 0).cars[
+        "drive_s"
+    ]
 
 
 @closed_form(
