@@ -27,7 +27,7 @@ from parkenv.studies.curve.study import CurveStudy
 from parkenv.studies.curve.zones import LONE, OF_CARS, STATE, Hours, Places, Zones, simulate_single_driver
 from parkenv.studies.fleet.day import Roads
 
-N_ZONES, N_HOURS, MULTIPLES, DAYS = 50, 4, (0.5, 1.0, 1.5, 2.0), 4
+N_ZONES, N_HOURS, MULTIPLES, DAYS = 60, 4, (0.5, 1.0, 1.5, 2.0), 4
 
 
 def search_law(occupancy, demand):
