@@ -105,7 +105,7 @@ def times_of(content):
 
 
 def test_a_task_weights_its_searches_and_uses_their_known_means(small, tmp_path, monkeypatch):
-    """Both strata of `mini` have the same worlds and known means of their own: the estimate is theirs, by hand."""
+    """Both strata of `mini` have the same worlds and known means of their own: the estimate is other, by hand."""
     mini = next(task for task in small.tasks if task.name == "mini")
     means = tuple(worlds_of(mini, small).mean(axis=0))
     parts = tuple(Stratum(share, mini.seeds, means) for share in (0.25, 0.75))
@@ -139,9 +139,9 @@ def test_precision_is_the_error_of_the_mean_difference_by_strata(small):
 
 def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, tmp_path, monkeypatch):
     monkeypatch.setattr(Suite, "packaged", classmethod(lambda cls: small))
-    theirs = json.loads(json.dumps(result)) | {"by": "</script><b>", "command": ["parkenv", "run", "a b"]}
-    theirs["sha256"] = fingerprint(theirs)
-    for name, content in (("ours", result), ("theirs", theirs)):
+    other = json.loads(json.dumps(result)) | {"by": "</script><b>", "command": ["parkenv", "run", "a b"]}
+    other["sha256"] = fingerprint(other)
+    for name, content in (("ours", result), ("other", other)):
         (tmp_path / name).mkdir()
         write_result(tmp_path / name, content, "result.json")
     page = tmp_path / "page.html"
@@ -162,16 +162,16 @@ def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, 
     assert len(tables["tasks"]["rows"]) == 2 * len(result["rows"])
     assert len(tables["times"]["rows"]) == 4
     page.unlink()
-    unknown = json.loads(json.dumps(theirs).replace("first-free", "my_agents:Own"))
+    unknown = json.loads(json.dumps(other).replace("first-free", "my_agents:Own"))
     unknown["sha256"] = fingerprint(unknown)
-    write_result(tmp_path / "theirs", unknown, "result.json")
+    write_result(tmp_path / "other", unknown, "result.json")
     bad = parkenv("benchmark", "page", tmp_path, "--out", page)
     assert (bad.returncode, page.exists()) == (2, False)
     assert "code is '', want the address of the code of my_agents:Own" in bad.stderr
-    write_result(tmp_path / "theirs", theirs | {"suite_sha256": "0" * 64}, "result.json")
+    write_result(tmp_path / "other", other | {"suite_sha256": "0" * 64}, "result.json")
     bad = parkenv("benchmark", "page", tmp_path, "--out", page)
     assert (bad.returncode, bad.stderr.count("\n"), page.exists()) == (2, 1, False)
-    assert "theirs" in bad.stderr
+    assert "other" in bad.stderr
 
 
 def test_the_suite_does_not_change_and_is_a_stratified_sample():

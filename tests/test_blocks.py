@@ -135,7 +135,7 @@ def test_the_map_holds_the_means_of_the_tables_in_one_small_file(run):
             cars = [day["arrivals"][which].sum() for day, which in zip(days, here, strict=True)]
             assert shown["blocks"]["arrivals"][number][i] == np.mean(cars)
     for cars in zip(*shown["states"].values(), strict=True):
-        assert sum(cars) == pytest.approx(np.mean([len(its) for its in run[1]]))
+        assert sum(cars) == pytest.approx(np.mean([len(cars) for cars in run[1]]))
     assert len(text) < 300_000
     assert not re.findall(r"https?://(?!www.w3.org)", text)
 

@@ -164,14 +164,14 @@ def test_a_lone_search_goes_on_to_the_next_best_place_as_often_as_one_is_full(be
     hours = Hours(np.array([believed]), full=np.array([[0.5, 0.2]]), inside_s=np.array([[3.0, 0.0]]))
     entry_drive_s, drive_s = np.array([[10.0, 12.0]]), np.array([[0.0, 13.0], [8.0, 0.0]])
     places = Places(entry_drive_s, drive_s, np.array([[10.0, 40.0]]), np.zeros(2), place + 1, place)
-    found = simulate_single_driver(cars, first, first, np.zeros((1, 1)), (1.0, 1.0), hours, places)
-    np.testing.assert_allclose(found[:, 0], expected)
+    measures = simulate_single_driver(cars, first, first, np.zeros((1, 1)), (1.0, 1.0), hours, places)
+    np.testing.assert_allclose(measures[:, 0], expected)
 
 
 def test_curves_are_called_with_arrays_and_say_what_there_is_not():
-    its = {"occupancy": [0.2, 0.5, 0.8], "demand": [0.1, 0.2, 0.4]}
-    its |= {f"search_s{end}": [10.0 + k, 20.0 + k, 60.0 + k] for k, end in enumerate(("", "_low", "_high"))}
-    curves = Curves({("town", zone, "all", hour): its for zone in "ab" for hour in ("8", "9")})
+    curve = {"occupancy": [0.2, 0.5, 0.8], "demand": [0.1, 0.2, 0.4]}
+    curve |= {f"search_s{end}": [10.0 + k, 20.0 + k, 60.0 + k] for k, end in enumerate(("", "_low", "_high"))}
+    curves = Curves({("town", zone, "all", hour): curve for zone in "ab" for hour in ("8", "9")})
     value = curves.search_s(occupancy=[[0.2], [0.65], [1.0]], zone=["a", "b"], hour=9).value
     assert value.shape == (3, 2)
     assert (value[0] == 10.0).all()
@@ -209,10 +209,10 @@ def test_the_command_writes_what_other_models_read(district, tmp_path):
     assert all(column["share"] for column in errors["columns"] if column["key"] in ("curve", *FORMS))
     assert "slots taken" in [column["label"] for column in rows["columns"]]
     curves = parkenv.load_curves(tmp_path / "a")
-    its = curves.curves["district", "0", "all", "8"]  # its own demand is 70 cars an hour
+    curve = curves.curves["district", "0", "all", "8"]  # its own demand is 70 cars an hour
     (row,) = (row for row in rows_in(tmp_path / "a" / "activitysim.csv") if row["zone_id"] == "0")
     assert float(row["TERMINAL_AM"]) == pytest.approx(
-        (its["search_s"][1] + its["walk_s"][1]) / 60.0, abs=0.01
+        (curve["search_s"][1] + curve["walk_s"][1]) / 60.0, abs=0.01
     )
     both = ["shoppers", "visitors"]
     value, low, high = curves.search_s(occupancy=[0.2, 0.9], zone="0", hour=8, purpose=both)

@@ -30,6 +30,7 @@ from parkenv.world.demand import (
 )
 from parkenv.world.occupancy.process import Forecast, PriorModel
 from planners.heuristics import POLICIES
+from planners.routes import DriveRoutes
 
 ALL_POLICIES = POLICIES | {ORDERED_ENTRY.name: ORDERED_ENTRY}
 NOISY = SensorModel(
@@ -213,7 +214,6 @@ def test_equal_seeds_give_equal_runs_and_demand_does_not_depend_on_drivers(argum
 def test_the_first_car_at_a_slot_has_it_and_the_second_fails():
     class Park:
         def predict(self, observation, state=None):
-            from planners.routes import DriveRoutes
 
             routes = DriveRoutes(scenario)
             vertex = int(observation["vertex"])

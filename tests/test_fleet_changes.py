@@ -97,15 +97,15 @@ def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
         {"name": name, "lot": str(tmp_path / "zoned.geojson"), "costs": {"prices": {"near": near, "far": 1.0}}, **HOURS}
         for name, near in (("before", 1.0), ("after", 1.2))
     ]  # fmt: skip
-    its = study(*specs, agents=("greedy-goal",), knows=("own",), arrivals_per_hour=(60.0,), days=3)
-    before, after = days = days_of(its)
+    priced = study(*specs, agents=("greedy-goal",), knows=("own",), arrivals_per_hour=(60.0,), days=3)
+    before, after = days = days_of(priced)
     prices = {"before": {"far": 1.0, "near": 1.0}, "after": {"far": 1.0, "near": 1.2}}
     rows = summarize_changes(days, prices)
     assert [row["zone"] for row in rows] == [None, "far", "near"]
     whole, *by_zone = rows
     paid = [[np.array(day["paid_cents"].split(), float).mean() / 100.0 for day in of] for of in days]
-    fleet, _ = its.fleet(its.fleet_settings[0])
-    fleet.reset(its.seed, 0)
+    fleet, _ = priced.fleet(priced.fleet_settings[0])
+    fleet.reset(priced.seed, 0)
     assert paid[0][0] == pytest.approx(fleet.cars["stay_s"].mean() / 3600.0, abs=0.01), "one price everywhere"
     assert whole["paid_change"] == pytest.approx(np.mean(np.subtract(*paid[::-1])))
     assert whole["paid_change"] > 0.0

@@ -28,8 +28,8 @@ def setting(agent, *rest):
     return Setting("mini", AgentSpec.of(agent), *rest)
 
 
-def days_of(its):
-    return [[its.run_day(one, day) for day in range(its.days)] for one in its.fleet_settings]
+def days_of(study):
+    return [[study.run_day(one, day) for day in range(study.days)] for one in study.fleet_settings]
 
 
 def test_gini():
@@ -40,8 +40,8 @@ def test_gini():
 
 
 def test_nobody_without_members_is_run_once():
-    its = experiment(knows=("own", "shared", "reserve"), shares=(0.0, 0.5, 1.0)).fleet_settings
-    assert its == [
+    settings = experiment(knows=("own", "shared", "reserve"), shares=(0.0, 0.5, 1.0)).fleet_settings
+    assert settings == [
         setting("greedy-drive", *rest, 20.0)
         for rest in (("own", 0.0), ("shared", 0.5), ("shared", 1.0), ("reserve", 0.5), ("reserve", 1.0))
     ]
@@ -61,11 +61,11 @@ def test_all_settings_have_the_same_days():
 
 
 def test_measures_of_a_day_are_those_of_its_cars():
-    its = experiment(arrivals_per_hour=(60.0,), shares=(0.5,))
-    its_setting = setting("greedy-drive", "shared", 0.5, 60.0)
-    day = its.run_day(its_setting, 0)
-    fleet, agents = its.fleet(its_setting)
-    fleet.reset(its.seed, 0)
+    study = experiment(arrivals_per_hour=(60.0,), shares=(0.5,))
+    chosen = setting("greedy-drive", "shared", 0.5, 60.0)
+    day = study.run_day(chosen, 0)
+    fleet, agents = study.fleet(chosen)
+    fleet.reset(study.seed, 0)
     fleet.run(agents)
     cars = fleet.cars
     members = (cars["kind"] == 0).mean()
@@ -84,8 +84,8 @@ def test_measures_of_a_day_are_those_of_its_cars():
 
 
 def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
-    its = experiment(knows=("own", "reserve"), arrivals_per_hour=(15.0, 30.0), days=3)
-    days = days_of(its)
+    study = experiment(knows=("own", "reserve"), arrivals_per_hour=(15.0, 30.0), days=3)
+    days = days_of(study)
     rows = summarize_days(days)
     for row in rows:
         low, high = row["price_of_anarchy_ci95"]

@@ -46,8 +46,8 @@ def second_arrives(fleet, seed=0):
 def test_the_live_map_holds_what_sharing_cars_have_observed(knows, shares, delay_s):
     fleet = Fleet("campus", TWO, drivers=[DriverKind(knows=knows, shares=shares)], delay_s=delay_s)
     viewed, (forecast, _, p_observed, observed_at) = second_arrives(fleet)
-    assert viewed
     known = set(np.flatnonzero(observed_at >= 0.0))
+    assert viewed
     assert known == (viewed if knows == "shared" and shares and delay_s == 0.0 else set())
     taken = fleet.taken()
     for slot in known:
@@ -80,14 +80,6 @@ def test_what_a_car_is_told_at_its_arrival_counts_as_an_observation_then():
         else:
             same = (again.p_occupied > belief.forecast) == (belief.p_occupied > belief.forecast)
             assert same[told.slots].mean() > 0.9
-
-
-def test_many_reports_wait_for_their_delay():
-    demand = Demand(PoissonArrivals(400.0, 36000.0, 43200.0), ExponentialTime(600.0), ConstantTime(600.0))
-    kinds = [DriverKind(policy=POLICIES["random"], knows="shared", shares=True)]
-    fleet = driven(Fleet("mini", demand, drivers=kinds, delay_s=1800.0), 0)
-    assert fleet.record["report_capacity"] > 4096
-    assert fleet.record["n_reports"] < fleet.record["report_capacity"]
 
 
 def test_full_knowledge_is_the_truth_at_every_decision():
@@ -138,7 +130,7 @@ def test_every_agent_drives_to_its_reserved_slot(name):
 def means(knows, demand, **options):
     kinds = [DriverKind(policy=POLICIES["first-free"], knows=knows, shares=True)]
     fleet = Fleet("campus", demand, drivers=kinds, leave_full_lot=False, **options)
-    return np.mean([driven(fleet, seed).cars["total_s"].mean() for seed in range(12)])
+    return np.mean([driven(fleet, seed).cars["total_s"].mean() for seed in range(10)])
 
 
 @pytest.mark.slow
@@ -155,11 +147,9 @@ def test_a_full_lot_is_left_at_once_or_searched_until_patience_ends(knows):
     searched = {}
     for leave in (True, False):
         fleet = driven(Fleet("mini", demand, background="none", drivers=kinds, leave_full_lot=leave), 0)
-        names = np.array(fleet.state_names())
-        n = fleet.scenario.lot.n_slots
-        assert (names == "parked").sum() == n
-        assert (names == ("gave_up" if leave else "balked")).sum() == 25 - n
-        without = names != "parked"
+        names, n = np.array(fleet.state_names()), fleet.scenario.lot.n_slots
+        without = names == ("gave_up" if leave else "balked")
+        assert ((names == "parked").sum(), without.sum()) == (n, 25 - n)
         searched[leave] = (fleet.cars["ended_at"] - fleet.cars["arrival"])[without].mean()
     assert searched[True] < 300.0 <= searched[False]
 

@@ -134,5 +134,4 @@ def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
     hours = summary["hours"]
     assert [row["hour"] for row in hours] == [7, 8, 9, 10, 11, 12]
     assert hours[0]["counted_occupancy"] < 0.3 < 0.7 < hours[4]["counted_occupancy"]
-    for its in hours:
-        assert its["occupancy"] == pytest.approx(its["counted_occupancy"], abs=0.05)
+    assert max(abs(hour["occupancy"] - hour["counted_occupancy"]) for hour in hours) < 0.05

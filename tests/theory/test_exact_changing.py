@@ -62,10 +62,12 @@ def times(scenario, agent, searches):
 def test_one_slot_is_one_look():
     """Observing it as taken proves that the lot is full: waiting gains nothing."""
     scenario = busy(1, taken=(0.8,), give_up_s=50.0)
-    found = solved(scenario, 20.0, (0.8,))
+    solution = solved(scenario, 20.0, (0.8,))
     entry = int(scenario.lot.entry_vertices[0])
     drive = float(scenario.move_s[entry][scenario.lot.neighbors[entry] >= 0].min())
-    assert found.expected_s(entry) == pytest.approx(drive + 0.2 * scenario.walk_s[0] + 0.8 * 50.0, abs=0.01)
+    assert solution.expected_s(entry) == pytest.approx(
+        drive + 0.2 * scenario.walk_s[0] + 0.8 * 50.0, abs=0.01
+    )
 
 
 def test_slots_that_hardly_change_give_the_static_optimum():
@@ -81,17 +83,17 @@ def test_slots_that_hardly_change_give_the_static_optimum():
 def test_searches_take_as_long_as_it_says_and_belief_hardly_longer():
     taken = (0.7, 0.85, 0.8)
     scenario = busy(taken=taken)
-    found = solved(scenario, 20.0, taken)
-    assert found.rounding_error < 1e-6
-    assert found.belief_error < 0.05
-    best = times(scenario, ChangingAgent(found), 200)
+    solution = solved(scenario, 20.0, taken)
+    assert solution.rounding_error < 1e-6
+    assert solution.belief_error < 0.05
+    best = times(scenario, ChangingAgent(solution), 200)
     mean, low, high = mean_interval(best)
-    assert low - 1.0 < found.expected_s(int(scenario.lot.entry_vertices[0])) < high + 1.0
-    ours = times(scenario, make_agent("belief", scenario), 200)
-    assert ours.mean() - mean < 0.02 * mean
+    assert low - 1.0 < solution.expected_s(int(scenario.lot.entry_vertices[0])) < high + 1.0
+    belief = times(scenario, make_agent("belief", scenario), 200)
+    assert belief.mean() - mean < 0.02 * mean
     # The thesis's planner also observes the last slot, which proves that the lot is full.
-    theirs = times(scenario, make_agent("mdp-tuned", scenario), 60)
-    assert theirs.mean() > 3.0 * mean
+    thesis = times(scenario, make_agent("mdp-tuned", scenario), 60)
+    assert thesis.mean() > 3.0 * mean
 
 
 def test_the_relaxation_stays_below_it_where_slots_change():

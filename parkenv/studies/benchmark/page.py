@@ -86,18 +86,18 @@ def _origin(result: Row) -> Row:
     return {column.key: result[column.key] or ("parkenv" if column.key == "code" else "") for column in _WHO}
 
 
-def precision(suite: Suite, one: Entry, other: Entry) -> Row:
+def precision(suite: Suite, entry: Entry, other: Entry) -> Row:
     """Return how precisely a run of the suite tells two agents apart.
 
     `error` is the standard error of the mean difference over the tasks, s; `searches_for_1_s` are those of each agent
     for an interval of ±1 s at 95 %.
     """
-    difference = mean_time(suite, one.minus(other), controls=False)
+    difference = mean_time(suite, entry.minus(other), controls=False)
     return {
-        "agents": f"{one.agent}, {other.agent}",
+        "agents": f"{entry.agent}, {other.agent}",
         **columns_of("behind_s", difference.interval()),
         "error": difference.error,
-        "searches_for_1_s": sum(map(len, one.times.values())) * (_WIDE * difference.error) ** 2,
+        "searches_for_1_s": sum(map(len, entry.times.values())) * (_WIDE * difference.error) ** 2,
     }
 
 

@@ -405,9 +405,9 @@ class Curves:
         InputError: there are none.
 
     Examples:
-        >>> its = {"occupancy": [0.2, 0.8], "demand": [0.1, 0.4]}
-        >>> its |= {"search_s": [10.0, 70.0], "search_s_low": [8.0, 60.0], "search_s_high": [12.0, 80.0]}
-        >>> Curves({("town", "all", "all", "all"): its}).search_s(occupancy=[0.2, 0.5, 0.9]).value
+        >>> curve = {"occupancy": [0.2, 0.8], "demand": [0.1, 0.4]}
+        >>> curve |= {"search_s": [10.0, 70.0], "search_s_low": [8.0, 60.0], "search_s_high": [12.0, 80.0]}
+        >>> Curves({("town", "all", "all", "all"): curve}).search_s(occupancy=[0.2, 0.5, 0.9]).value
         array([10., 40., 70.])
     """
 

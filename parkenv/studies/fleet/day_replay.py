@@ -44,8 +44,8 @@ def map_replay(study: FleetStudy, folder: Path) -> ReplayJob:
 
 
 def write_map_page(study: FleetStudy, summary: Row, rows: Rows, folder: Path) -> None:
-    told = without_nan(summary)
-    page = page_data("fleet", study.page(told, folder), told, map_recordings(study, rows))
+    summary = without_nan(summary)
+    page = page_data("fleet", study.page(summary, folder), summary, map_recordings(study, rows))
     write_page(page, folder / "fleet.html")
 
 

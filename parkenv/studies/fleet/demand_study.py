@@ -11,8 +11,6 @@ import numpy as np
 from pydantic import Field
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import write_text
-from parkenv.files.csv_tables import csv_columns
 from parkenv.files.option import option
 from parkenv.files.spec_file import FilePath
 from parkenv.scenarios.purposes import PurposeSpec
@@ -21,13 +19,12 @@ from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
+from parkenv.studies.fingerprints import search_settings
 from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.study import Cell, Stage, Study, counted
 from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from parkenv.compiled.arrays import FloatArray, IntArray
     from parkenv.studies.fleet.counted_demand import CountedTown
     from parkenv.studies.runner import Result
@@ -150,8 +147,6 @@ class DemandStudy(Study):
             )
 
     def settings(self) -> Row:
-        from parkenv.studies.fingerprints import search_settings
-
         more = ("weeks", "held_out", "rounds", "episodes", "timezone", "seed")
         return search_settings(self, *more) | {"from": str(self._first), "agent": self.agent.label}
 
@@ -265,7 +260,9 @@ class DemandStudy(Study):
         town, held_out, fits = self.town, self._held_out(result.results), result.results.rows(FITTED)
         last, first_kind = self.roll_outs - 1, None
         predictions = list(result.results.rows(DAYS).values())
-        tasks: list[Task[object]] = [partial(_write_predictions, predictions, result.folder)]
+        columns = ("car_park", "hour", "counted", *PREDICTIONS)
+        table = Table("predicted.csv", ("date",), columns, long=True)
+        tasks: list[Task[object]] = [partial(table.write, result.folder, predictions)]
         for kind in KINDS:
             if car_parks := fits[last, kind]["car_parks"]:
                 demand = self.scenario.demand | {name: fit["purpose"] for name, fit in car_parks.items()}
@@ -277,11 +274,13 @@ class DemandStudy(Study):
         shown = np.isin(held_out.days, self.days(last)[1])
         shown &= np.isin(town.counts.weekday[held_out.days], KINDS[first_kind])
         cars = {name: of[:, shown] * town.capacity[:, None, None] for name, of in held_out.shares.items()}
-        car_park_days = []
-        for k in np.flatnonzero(np.isfinite(cars["counted"]).any(axis=(1, 2))):
-            simulated, followed = np.nanmean(cars["simulated"][k], axis=0), cars["mean_followed"][k][0]
-            of_park = town.names[k], town.capacity[k], simulated, followed, cars["counted"][k]
-            car_park_days.append(CarParkDays(*of_park))
+        simulated, followed, known = cars["simulated"], cars["mean_followed"], cars["counted"]
+        car_park_days = [
+            CarParkDays(
+                town.names[k], town.capacity[k], np.nanmean(simulated[k], axis=0), followed[k][0], known[k]
+            )
+            for k in np.flatnonzero(np.isfinite(known).any(axis=(1, 2)))
+        ]
         hours = town.hours.astype(np.float64) + 1.0
         return [*tasks, partial(save_counted_demand, car_park_days, hours, result.folder / "demand.png")]
 
@@ -306,13 +305,6 @@ class _Fits(DemandStudy):
         days = followed[np.isin(self.town.counts.weekday[followed], KINDS[kind])]
         fit = self.town.fitted(days, self.rounds, self.episodes, self.seed)
         return [{**work.columns, "kind": kind, "car_parks": fit}]
-
-
-def _write_predictions(days: Sequence[Row], folder: Path) -> None:
-    columns = ("car_park", "hour", "counted", *PREDICTIONS)
-    lines = [[line for day in days for line in day[column]] for column in columns]
-    dates = [day["date"] for day in days for _ in day["hour"]]
-    write_text(folder / "predicted.csv", f"{','.join(('date', *columns))}\n{csv_columns([dates, *lines])}")
 
 
 def kind_of(weekday: int) -> str:
