@@ -111,7 +111,7 @@ def env_rows(
     for name in missing:
         rows += absent("single", f"{name}: not installed", "steps/s")
     for case, envs in batches.items():
-        rows += rate("memory", case, envs.bytes_each / 1024, "KiB an environment")
+        rows += rate("memory", case, envs.observer.n_bytes / envs.num_envs / 1024, "KiB an environment")
     case = f"batch of {batch}, {places} places"
     rows += rate("memory", f"{case}, tables of the places", changing.table_bytes / 2**20, "MiB")
     rows += rate("memory", f"{case}, tables and environments", changing.memory_bytes / 2**20, "MiB")

@@ -18,7 +18,7 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.sensing.surveys import session_row, summarize
 from parkenv.studies.statistics import mean_interval
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.occupancy.constant_map import ConstantForecast
+from parkenv.world.occupancy.process import ConstantForecast
 
 lot = grid_lot(4, 20)
 world = make_scenario(lot, arrival=ArrivalWindow.parse("11:00-13:00"))

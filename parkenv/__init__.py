@@ -66,36 +66,11 @@ _EXPORTS = {
     for name in names
 }
 __all__ = [
-    "ArrivalWindow",
-    "InputError",
-    "Lane",
-    "Mouth",
-    "OccupancyLog",
-    "OccupancyProcess",
-    "ParkingLot",
-    "RecordedOccupancy",
-    "Result",
-    "Scenario",
-    "SearchProblem",
-    "SensorBand",
-    "SensorModel",
-    "Traffic",
-    "Turn",
-    "compare",
-    "curve",
-    "fleet",
-    "import_lot",
-    "load_curves",
-    "load_lot",
-    "make_agent",
-    "make_scenario",
-    "make_scenarios",
-    "model",
-    "open_run",
-    "simulate",
-    "survey",
-    "train",
-]
+    "ArrivalWindow", "InputError", "Lane", "Mouth", "OccupancyLog", "OccupancyProcess", "ParkingLot",
+    "RecordedOccupancy", "Result", "Scenario", "SearchProblem", "SensorBand", "SensorModel", "Traffic", "Turn",
+    "compare", "curve", "fleet", "import_lot", "load_curves", "load_lot", "make_agent", "make_scenario",
+    "make_scenarios", "model", "open_run", "simulate", "survey", "train",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -18,13 +18,11 @@ class InputError(ValueError):
 
 
 def needs_extra(what: str, extra: str) -> str:
-    """Say that something needs an extra of the package, and how to install it."""
     return f"{what} needs the extra {extra}: pip install 'parkenv[{extra}]'"
 
 
 @contextmanager
 def with_extra(what: str, extra: str) -> Iterator[None]:
-    """Import packages of an extra in the block."""
     try:
         yield
     except ImportError as error:
@@ -40,6 +38,11 @@ def naming(source: object) -> Iterator[None]:
         if str(error).startswith(f"{source}: "):
             raise
         raise InputError(f"{source}: {error}") from error
+
+
+def require(good: object, message: str) -> None:
+    if not good:
+        raise InputError(message)
 
 
 def require_number(
@@ -59,7 +62,7 @@ def require_number(
         Traceback (most recent call last):
         parkenv.errors.InputError: every is -1.0, want a finite number above 0
     """
-    good = isinstance(value, Real) and not _is_flag(value) and not math.isnan(value)
+    good = isinstance(value, Real) and type(value) is not bool and not math.isnan(value)
     if (
         not good
         or (finite and math.isinf(value))
@@ -78,20 +81,18 @@ def require_number(
 
 def require_whole(name: str, value: Any, *, least: int = 0, most: int | None = None) -> None:
     """Check that a value is a whole number of at least `least` and, unless that is None, at most `most`."""
-    good = isinstance(value, Integral) and not _is_flag(value)
+    good = isinstance(value, Integral) and type(value) is not bool
     if not good or value < least or (most is not None and value > most):
         wanted = f"of at least {least}" if most is None else f"from {least:,} to {most:,}"
         raise InputError(f"{name} is {value!r:.60}, want a whole number {wanted}")
 
 
 def require_one_of(name: str, value: object, known: Collection[object]) -> None:
-    """Check that a value is one of those known."""
     if value not in known:
         raise InputError(f"{name} is {value!r:.60}, want one of {', '.join(map(str, known)) or 'none'}")
 
 
 def reset_options(options: object, known: Collection[str]) -> dict[str, Any]:
-    """Return the options of a call of `reset` by name; None stands for no options."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):
@@ -112,10 +113,6 @@ def require_keywords(function: str, given: Iterable[str], known: Collection[str]
             raise TypeError(
                 f"{function}() got an unexpected keyword argument {name!r}; {nearest(name, known)}"
             )
-
-
-def _is_flag(value: object) -> bool:
-    return isinstance(value, bool)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

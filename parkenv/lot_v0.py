@@ -83,23 +83,23 @@ class _CarsAsAgents:
         self.possible_agents = [f"car_{i}" for i in range(demand.max_cars)]
         self.agents: list[str] = []
         self._observation_space = self.fleet.observation_space
-        self._observation_spaces: dict[str, spaces.Dict] = {}
-        self._action_spaces: dict[str, spaces.Discrete] = {}
+        self._spaces: dict[str, tuple[spaces.Dict, spaces.Discrete]] = {}
         self._seed: int | None = None
         self._episode = 0
         self._renderer: FleetRenderer | None = None
 
     def observation_space(self, agent: str) -> spaces.Dict:
         """Return the space of an agent's observations, always the same object; that of `parkenv/Search-v2`."""
-        if agent not in self._observation_spaces:
-            self._observation_spaces[agent] = spaces.Dict(dict(self._observation_space.items()))
-        return self._observation_spaces[agent]
+        return self._spaces_of(agent)[0]
 
     def action_space(self, agent: str) -> spaces.Discrete:
-        """Return the space of an agent's actions, always the same object."""
-        if agent not in self._action_spaces:
-            self._action_spaces[agent] = spaces.Discrete(len(ACTIONS))
-        return self._action_spaces[agent]
+        return self._spaces_of(agent)[1]
+
+    def _spaces_of(self, agent: str) -> tuple[spaces.Dict, spaces.Discrete]:
+        if agent not in self._spaces:
+            own = spaces.Dict(dict(self._observation_space.items()))
+            self._spaces[agent] = own, spaces.Discrete(len(ACTIONS))
+        return self._spaces[agent]
 
     def _begin(self, seed: int | None) -> list[str]:
         if seed is not None:
@@ -113,7 +113,7 @@ class _CarsAsAgents:
         return self.possible_agents[: len(self.fleet.cars)]
 
     def _blank_observation(self, car: int) -> dict[str, Any]:
-        boxes = {name: one for name, one in self._observation_space.items() if isinstance(one, spaces.Box)}
+        boxes = {name: box for name, box in self._observation_space.items() if isinstance(box, spaces.Box)}
         blank: dict[str, Any] = {name: np.zeros(box.shape, box.dtype) for name, box in boxes.items()}
         blank["vertex"] = np.int64(self.fleet.cars["entry"][car])
         blank["p_occupied"][:] = 1.0
@@ -123,7 +123,6 @@ class _CarsAsAgents:
         return blank
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a frame from above, (480, 640, 3) uint8 RGB, or show it in a window, depending on `render_mode`."""
         if self.render_mode is None:
             gym.logger.warn('render() does nothing without a render_mode, e.g. env(render_mode="rgb_array")')
             return None
@@ -138,7 +137,6 @@ class _CarsAsAgents:
         return None
 
     def close(self) -> None:
-        """Close the window, if open, and end the world."""
         self.agents = []
         if self._renderer is not None:
             self._renderer.window.close()
@@ -242,7 +240,6 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
     """
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Begin a world; see the class for seeds."""
         del options
         self.agents = list(self._begin(seed))
         self.rewards = dict.fromkeys(self.agents, 0.0)
@@ -256,7 +253,6 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
         self._select()
 
     def _select(self) -> None:
-        """Go on to the next decision, or to the next car whose search has ended."""
         car = self.fleet.next_car()
         if car is None:
             assert not self.agents, "every car is selected once more when its search is over"
@@ -271,7 +267,6 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
         self.terminations[agent] = state not in (SEARCHING, TRUNCATED)
 
     def step(self, action: Any) -> None:
-        """Carry out the decision of `agent_selection`; None for a car whose search is over."""
         if not self.agents:
             raise ResetNeeded("no car searches: call reset()")
         agent = self.agent_selection
@@ -288,7 +283,6 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
             self.render()
 
     def observe(self, agent: str) -> Observation | None:
-        """Return what an agent's car observed last; nothing is known before it arrives."""
         car = _car_of(agent)
         if self.fleet.cars["search"][car] == 0:
             return self._blank_observation(car)
@@ -339,7 +333,6 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
-        """Begin a world; see `LotEnv` for seeds. `options` are ignored."""
         del options
         self.agents = list(self._begin(seed))
         self._observations = {agent: self._blank_observation(_car_of(agent)) for agent in self.agents}

@@ -3,7 +3,7 @@
 from parkenv.compiled.memory import int64s
 from parkenv.engine.policy import LEAVE, TAKE_SLOT, CompiledPolicy
 from parkenv.engine.records import car_at, fleet_at
-from parkenv.engine.shared_slots import is_slot_open
+from parkenv.engine.search_belief import is_slot_open
 from parkenv.world.occupancy.kernel import inlined, kernel
 
 

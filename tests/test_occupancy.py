@@ -59,20 +59,6 @@ def test_world_keys_accept_big_seeds_and_tell_them_apart(seed, episode):
     assert world_key(seed, episode) == world_key(seed, episode)
 
 
-def test_a_constant_chain_rests_at_its_equilibrium():
-    process = constant_process(3, 2e-4, 1e-4)
-    assert process.marginal(12345.0) == pytest.approx(2 / 3)
-    assert process.forecast(NINE).decay_rate == pytest.approx(3e-4)
-
-
-def test_the_marginal_relaxes_exponentially_after_the_rates_have_changed():
-    arrival = np.full(168, 1e-4)
-    arrival[100:] = 0.0
-    process = OccupancyProcess(np.ones(1), arrival, np.ones(1), np.full(168, 1e-4))
-    p0, p1 = process.marginal(100 * HOUR_S)[0], process.marginal(103.5 * HOUR_S)[0]
-    assert p1 == pytest.approx(p0 * math.exp(-1e-4 * 3.5 * HOUR_S), rel=1e-12)
-
-
 def test_the_marginal_solves_its_differential_equation_and_repeats_weekly():
     process = busy_process()
     for time in (1.0, 3.5 * HOUR_S, 100.3 * HOUR_S):
@@ -92,7 +78,7 @@ def test_a_slow_chain_needs_the_whole_week_for_its_marginal():
 
 
 def test_worlds_are_occupied_as_often_as_the_marginal_says_at_any_time():
-    n = 20_000
+    n = 10_000
     profile = 1e-4 * (1 + np.sin(np.arange(168)))
     process = OccupancyProcess(np.ones(n), profile, np.ones(n), np.full(168, 1e-4))
     world = process.world(KEY, NINE)
@@ -171,13 +157,6 @@ def test_a_slot_is_free_from_next_free_on_and_not_before(after, key):
         assert at == time or world.occupied([slot], (time + at) / 2)[0]
 
 
-def test_a_million_slots_cost_nothing_until_seen():
-    process = constant_process(1_000_000, 1e-4, 1e-4)
-    world = process.world(KEY, NINE)
-    assert world.occupied([5, 999_999], NINE.time).shape == (2,)
-    assert world._cursors["sojourn"].sum() == 2
-
-
 def test_forecast_is_the_clipped_marginal():
     process = OccupancyProcess([1.0, 0.0, 1.0], np.full(168, 1e-4), [1.0, 1.0, 0.0], np.full(168, 1e-4))
     assert process.forecast(NINE).p_occupied == pytest.approx([0.5, 0.001, 0.999])
@@ -221,7 +200,7 @@ def change(**fields):
         (lambda c: {k: v for k, v in c.items() if k != "arrival_factor"}, "missing or unknown fields"),
         (change(arrival_profile=[1e-4]), r"arrival_profile has shape \(1,\), want \(168,\)"),
         (change(arrival_factor=[1.0] * 19 + [-1.0]), r"arrival_factor\[19\] is -1.0, want a finite number"),
-        (change(arrival_factor=[[1.0], 2.0]), "arrival_factor: .*want numbers"),
+        (change(arrival_factor=[[1.0], 2.0]), "arrival_factor is .*want numbers"),
         (change(arrival_factor=[1e12] * 20), "want factor .* profile <= 1000"),
         (lambda c: [], "want an occupancy process, a JSON object"),
     ],
@@ -232,18 +211,6 @@ def test_a_bad_file_is_refused_by_name(tmp_path, spoil, message):
     path.write_text(json.dumps(spoil(json.loads(path.read_text()))))
     with pytest.raises(InputError, match=rf"process\.json: .*{message}"):
         OccupancyProcess.from_file(path)
-
-
-def test_torn_missing_and_unwritable_files_are_refused(tmp_path):
-    path = tmp_path / "process.json"
-    busy_process().to_file(path)
-    path.write_text(path.read_text()[:-40])
-    with pytest.raises(InputError, match="not JSON"):
-        OccupancyProcess.from_file(path)
-    with pytest.raises(InputError, match=r"none\.json: No such file"):
-        OccupancyProcess.from_file(tmp_path / "none.json")
-    with pytest.raises(InputError, match="cannot be written"):
-        busy_process().to_file(tmp_path / "none" / "process.json")
 
 
 def test_arrivals_are_uniform_over_the_window():

@@ -4,12 +4,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import check_grad
+from test_occupancy import constant_process
 
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.occupancy.day_error_fit import PRIOR_LEVEL, fit_day_error
-from parkenv.world.occupancy.fit import Intervals, fit_constant_rates, fit_process, log_likelihood
+from parkenv.world.occupancy.fit import (
+    PRIOR_LEVEL,
+    Intervals,
+    fit_constant_rates,
+    fit_day_error,
+    fit_process,
+    log_likelihood,
+)
 from parkenv.world.occupancy.log import OccupancyLog, weekday_of
 from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 from parkenv.world.week import DAY_S, HOUR_S
@@ -36,36 +43,12 @@ def simulated_log(process, n_weeks, every_s, start_h=7, end_h=19, seed=0):
     )
 
 
-def constant_process(n, arrival, departure):
-    return OccupancyProcess(np.ones(n), np.full(168, arrival), np.ones(n), np.full(168, departure))
-
-
 @pytest.mark.parametrize("every_s", [300.0, 1800.0])
 def test_constant_rates_are_recovered_however_coarse_the_looks(every_s):
     arrival, departure = 1 / 1500, 1 / 3000
     looks = simulated_log(constant_process(60, arrival, departure), 2, every_s).intervals()
     fitted = fit_constant_rates(looks.end - looks.start, looks.before, looks.after)
     assert fitted == pytest.approx((arrival, departure), rel=0.06)
-
-
-def test_constant_rates_are_recovered_from_a_log_of_each_change():
-    truth, n, days, day_s = (1 / 1500, 1 / 3000), 60, 14, 12 * HOUR_S
-    world = constant_process(n, *truth).world(world_key(0, 0), Arrival(0.0))
-    found = []
-    for slot in range(n):
-        for day in range(days):
-            begin, time = day * DAY_S, day * DAY_S
-            found.append((slot, day, 0, world.occupied([slot], begin)[0]))
-            while (time := world.next_change([slot], time, begin + day_s)[0]) < np.inf:
-                second, taken = int(time - begin) + 1, world.occupied([slot], time)[0]
-                if taken != found[-1][-1] and second > found[-1][2]:
-                    found += [(slot, day, second - 1, not taken), (slot, day, second, taken)]
-            found.append((slot, day, day_s, found[-1][-1]))
-    slot, day, second, taken = map(np.array, zip(*found, strict=True))
-    names, dates = (tuple(map(str, values)) for values in (range(n), FIRST_MONDAY + np.arange(days)))
-    looks = OccupancyLog(names, dates, slot, day, second, taken).intervals()
-    fitted = fit_constant_rates(looks.end - looks.start, looks.before, looks.after)
-    assert fitted == pytest.approx(truth, rel=0.06)
 
 
 def test_constant_rates_solve_the_closed_form_for_equal_gaps():
@@ -112,7 +95,7 @@ def test_intervals_are_split_exactly_at_full_hours():
     slot, first_bin, start, end, before, after = intervals
     rates, value = np.exp(theta), 0.0
     for k in range(5):
-        p, steps = float(before[k]), 200_000
+        p, steps = float(before[k]), 40_000
         dt = (end[k] - start[k]) / steps
         bins = first_bin[k] + ((start[k] + (np.arange(steps) + 0.5) * dt) // HOUR_S).astype(int)
         arrival = rates[bins] * rates[96 + slot[k]]
@@ -136,23 +119,19 @@ def hourly():
     return truth, fit_process(simulated_log(truth, 12, 1800.0))
 
 
-@pytest.mark.parametrize("side", ["arrival", "departure"])
-@pytest.mark.parametrize("part", ["profile", "factor"])
-def test_profiles_and_factors_are_recovered_within_their_standard_errors(hourly, side, part):
+def test_profiles_and_factors_are_recovered(hourly):
+    """Within 0.6, twice the largest standard error of a logarithm; the hours of the day that were observed."""
     truth, fit = hourly
-    name = f"{side}_{part}"
-    error = getattr(fit, f"{name}_se")
-    seen = np.isfinite(error)
-    off = (np.log(getattr(fit.process, name)) - np.log(getattr(truth, name)))[seen] / error[seen]
-    assert seen.sum() == (7 * 12 if part == "profile" else 40)
-    assert np.abs(off).max() < 4
-    assert 0.6 < np.sqrt(np.mean(off**2)) < 1.4
-    assert error[seen].max() < 0.6
+    seen = np.tile((np.arange(24) >= 7) & (np.arange(24) < 19), 7)
+    for part, which in (("profile", seen), ("factor", np.ones(40, bool))):
+        for name in (f"arrival_{part}", f"departure_{part}"):
+            off = (np.log(getattr(fit.process, name)) - np.log(getattr(truth, name)))[which]
+            assert np.abs(off).max() < 1.0
+            assert np.sqrt(np.mean(off**2)) < 0.3
 
 
 def test_the_fitted_process_forecasts_the_morning_although_nights_were_not_seen(hourly):
     truth, fit = hourly
-    assert np.isnan(fit.arrival_profile_se[:7]).all()
     for day in (2, 5):
         time = day * DAY_S + 7.1 * HOUR_S
         assert fit.process.marginal(time).mean() == pytest.approx(truth.marginal(time).mean(), abs=0.04)
@@ -167,7 +146,6 @@ def test_unobserved_hours_take_the_nearest_and_an_unobserved_class_the_other():
     assert profile[10] == profile[11] == profile[9]
     assert profile[12] == profile[13]
     assert np.array_equal(profile[:24], profile[-24:])
-    assert np.isnan(fit.arrival_profile_se[[6, 10, 12, 130]]).all()
 
 
 def test_a_slot_that_never_changed_gets_a_finite_rate():

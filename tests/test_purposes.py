@@ -18,8 +18,7 @@ from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import demand_in, record_days
-from parkenv.world.arrivals import Headways, NoArrivals, PoissonArrivals
-from parkenv.world.counted_demand import follow_counts
+from parkenv.world.arrivals import Headways, NoArrivals, PoissonArrivals, follow_counts
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, LogNormalTime, TownDemand
 from parkenv.world.durations import rest_of_stay
 from parkenv.world.facility import Facility

@@ -11,8 +11,7 @@ from parkenv import compare, make_scenario
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot
-from parkenv.world.occupancy.process import Arrival, OccupancyProcess, World
-from parkenv.world.occupancy.slot_law import SlotLaw
+from parkenv.world.occupancy.process import Arrival, OccupancyProcess, SlotLaw, World
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.tariff import Zone
 from planners.bounds.exact import ExactSolution

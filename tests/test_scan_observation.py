@@ -32,11 +32,8 @@ def expected(measured, goal):
     ]
     numbers += [math.cos(yaw), math.sin(yaw)]
     for wavelength in WAVELENGTHS_M:
-        for metres in (x, y):
-            numbers += [
-                math.sin(2 * math.pi * metres / wavelength),
-                math.cos(2 * math.pi * metres / wavelength),
-            ]
+        for phase in (2 * math.pi * x / wavelength, 2 * math.pi * y / wavelength):
+            numbers += [math.sin(phase), math.cos(phase)]
     for one in seen[: -SCANS - 1 : -1]:
         then = one["pose"][0].astype(float)
         turn, (dx, dy) = then[2] - yaw, then[:2] - (x, y)

@@ -16,9 +16,8 @@ from parkenv.mapping.store import MapStore, Session
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 from parkenv.studies.study import schemas
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.occupancy.constant_map import ConstantForecast
 from parkenv.world.occupancy.day_error import DayError, nearness
-from parkenv.world.occupancy.process import Arrival
+from parkenv.world.occupancy.process import Arrival, ConstantForecast
 from parkenv.world.occupancy.recorded import RecordedOccupancy
 from parkenv.world.occupancy.typical_week import typical_occupancy
 

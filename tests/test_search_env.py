@@ -14,10 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
-from parkenv.belief.slot_belief import bayes_update, decay_to_prior
-from parkenv.engine.kernel import STEP_RESULT, read_step, step_exact_at
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.envs.search import SearchEnv
 from parkenv.lots import grid_lot
-from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.decay import decay_factor
 
@@ -68,15 +67,7 @@ def test_stable_baselines_accepts_it(env_id):
     check_sb3(gym.make(env_id, scenario="mini").unwrapped)
 
 
-@pytest.mark.parametrize("scenario", ["campus", "jam"])
-def test_equal_seeds_give_equal_episodes(scenario):
-    one, two = (gym.make("parkenv/Search-v2", scenario=scenario) for _ in range(2))
-    for seed in (0, 1, 2**40):
-        assert digest(one, seed) == digest(two, seed)
-    assert digest(one, 0) != digest(one, 1)
-
-
-def test_equal_seeds_give_equal_episodes_in_another_process():
+def test_equal_seeds_give_equal_episodes_here_and_in_another_process():
     program = (
         "import sys; sys.path.insert(0, 'tests'); import gymnasium as gym, parkenv;"
         "from test_search_env import digest; print(digest(gym.make('parkenv/Search-v2', scenario='street'), 5))"
@@ -84,21 +75,12 @@ def test_equal_seeds_give_equal_episodes_in_another_process():
     theirs = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
-    assert theirs.strip() == digest(gym.make("parkenv/Search-v2", scenario="street"), 5)
-
-
-def test_resets_without_a_seed_go_through_other_worlds_of_the_same_seed():
-    env = gym.make("parkenv/Search-v2", scenario="mini")
-    runs = []
-    for _ in range(2):
-        env.reset(seed=4)
-        runs.append([float(env.reset()[0]["time"][0]) for _ in range(3)])
-    assert runs[0] == runs[1]
-    assert len(set(runs[0])) == 3
+    env = gym.make("parkenv/Search-v2", scenario="street")
+    assert theirs.strip() == digest(env, 5) == digest(env, 5) != digest(env, 2**40)
 
 
 @given(seed=st.integers(0, 1000))
-@settings(max_examples=20)
+@settings(max_examples=8)
 def test_the_world_does_not_depend_on_who_drives(seed):
     """Two cars that behave differently meet the same slot states at the same times."""
     scenario = make_scenario("street")
@@ -113,38 +95,6 @@ def test_the_world_does_not_depend_on_who_drives(seed):
         times = state.arrival.time + np.array([0.0, 60.0, 600.0, 3600.0])
         worlds.append([state.world.occupied(np.arange(scenario.lot.n_slots), t) for t in times])
     np.testing.assert_array_equal(worlds[0], worlds[1])
-
-
-def test_a_step_returns_the_numbers_in_the_order_of_their_names():
-    env = gym.make("parkenv/Search-v2", scenario="mini").unwrapped
-    env.reset(seed=0)
-    record = env.searches.records[0]
-    for action in (3, PARK, 3):
-        result = dict(zip(STEP_RESULT, step_exact_at(env.searches.address, action), strict=True))
-        for name in (*METRICS, "over", "vertex"):
-            if name != "total_s":
-                assert result[name] == record[name], name
-        terms = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
-        assert [result[name] for name in REWARD_TERMS] == [-record[f"step_{name}"] for name in terms]
-        assert result["total_s"] == pytest.approx(sum(record[name] for name in terms))
-        read = read_step("mini", tuple(result.values()))
-        assert read[3]["reward_terms"] == {name: result[name] for name in REWARD_TERMS}
-        assert read[3] == {**read[3], **{name: result[name] for name in METRICS}, "scenario": "mini"}
-        assert list(read[3]) == ["reward_terms", *METRICS, "scenario"]
-
-
-@pytest.mark.parametrize("scenario", ["street", "mini"])
-def test_reward_terms_add_up_and_the_return_is_minus_the_total_time(scenario):
-    env = gym.make("parkenv/Search-v2", scenario=scenario)
-    for seed in range(5):
-        steps = random_episode(env, seed, steps=2000)[1:]
-        for _, reward, _, _, info in steps:
-            assert reward == pytest.approx(sum(info["reward_terms"].values()))
-        info = steps[-1][-1]
-        assert -sum(s[1] for s in steps) == pytest.approx(info["total_s"])
-        assert info["total_s"] == pytest.approx(
-            info["drive_s"] + info["failed_s"] + info["walk_s"] + info["gave_up_s"]
-        )
 
 
 def two_slots(taken):
@@ -265,6 +215,9 @@ def test_the_observed_belief_explains_p_occupied(noisy):
         moves = np.flatnonzero(observation["action_mask"][:PARK])
         observation, *_ = env.step(rng.choice(moves))
     assert observed.sum() > 10
+    now, exact = SlotBelief.of_observation(observation), env.state.belief
+    for name in "forecast p_occupied p_observed observed_at age observed_free observed_taken".split():
+        np.testing.assert_allclose(getattr(now, name), getattr(exact, name), rtol=1e-6, atol=1e-4)
 
 
 def test_old_ids_are_not_registered():
@@ -274,19 +227,6 @@ def test_old_ids_are_not_registered():
             pytest.raises(gym.error.DeprecatedEnv, match=f"parkenv/{name}-v{version}"),
         ):
             gym.make(f"parkenv/{name}-v{version - 1}")
-
-
-def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
-    said = bayes_update(0.6, True, 0.9, 0.2)
-    assert said == pytest.approx(0.9 * 0.6 / (0.9 * 0.6 + 0.2 * 0.4))
-    assert decay_to_prior(0.6, 1 / 600, said, 300.0) == pytest.approx(
-        0.6 + (said - 0.6) * np.exp(-0.5), rel=1e-14
-    )
-    assert decay_to_prior(0.6, 1 / 600, said, 0.0) == pytest.approx(said, rel=1e-15)
-    # Certain beliefs stay exactly certain until time passes.
-    assert [decay_to_prior(0.3, 1 / 600, certain, 0.0) for certain in (0.0, 1.0)] == [0.0, 1.0]
-    assert decay_to_prior(0.6, 1 / 600, said, 1e9) == 0.6
-    assert bayes_update(0.0, True, 1.0, 0.0) == 1.0, "a look that was held to be impossible is believed"
 
 
 @given(x=st.floats(0.0, 600.0))
@@ -316,7 +256,7 @@ def test_sight_differs_by_distance_and_side():
     env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
     seen, looked_taken = np.zeros(lot.n_slots), np.zeros(lot.n_slots)
     way_to_0 = next(c for c in range(4) for v in [lot.neighbors[lot.entry_vertices[0], c]] if v >= 0)
-    seeds = 400
+    seeds = 250
     for seed in range(seeds):
         env.reset(seed=seed)
         env.step(way_to_0)
@@ -324,27 +264,9 @@ def test_sight_differs_by_distance_and_side():
         looked_taken += env.state.belief.p_occupied > env.state.belief.forecast
     rows = slice(*starts[env.state.vertex : env.state.vertex + 2])
     view, rates = slots[rows], scenario.sensor_rates.of(rows)
-    np.testing.assert_allclose(seen[view] / seeds, rates.seen, atol=0.08)
+    np.testing.assert_allclose(seen[view] / seeds, rates.seen, atol=0.1)
     expected = np.where(taken[view], rates.hit, rates.false_alarm)
-    np.testing.assert_allclose((looked_taken / np.maximum(seen, 1))[view], expected, atol=0.12)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"v_walk": -1.0}, "v_walk is -1.0"),
-        ({"failure_s": -2.0}, "failure_s"),
-        ({"goal": 9}, "goal is 9"),
-        ({"entry": -1}, "entry"),
-        ({"sensor_model": 3}, "SensorModel"),
-        ({"render_mode": "hologram"}, "render_mode"),
-    ],
-)
-def test_wrong_options_are_refused_by_name(changes, message):
-    from parkenv.envs.search import SearchEnv
-
-    with pytest.raises(InputError, match=message):
-        SearchEnv(**({"scenario": "mini"} | changes))
+    np.testing.assert_allclose((looked_taken / np.maximum(seen, 1))[view], expected, atol=0.15)
 
 
 def test_wrong_use_is_refused():
@@ -358,3 +280,8 @@ def test_wrong_use_is_refused():
     for wrong in ({"hit_rate": 1.2}, {"view_range": -1.0}, {"hit_rate": 0.2, "false_alarm_rate": 0.3}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             SensorModel(**wrong)
+    for wrong in ({"v_walk": -1.0}, {"failure_s": -2.0}, {"goal": 9}, {"entry": -1}, {"sensor_model": 3}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            gym.make("parkenv/Search-v2", scenario="mini", **wrong)
+    with pytest.raises(InputError, match="render_mode"):
+        SearchEnv(scenario="mini", render_mode="hologram")

@@ -49,7 +49,7 @@ def make_batch(n, scenario, **options):
     )
 
 
-def assert_parity(scenarios, observation="full", n=4, steps=250, **changes):
+def assert_parity(scenarios, observation="full", n=4, steps=150, **changes):
     """Whole episodes, several in a row, of each search of a batch and of the single environment of its seed.
 
     Returns the names of the places of the episodes that ended.
@@ -130,32 +130,6 @@ def test_gymnasium_s_own_batch_of_single_environments_says_the_same():
             assert value.dtype == wanted.dtype
 
 
-def test_same_step_resets_at_once_and_hands_out_the_end():
-    at_once = make_batch(4, "mini", max_episode_steps=LIMIT, autoreset_mode=AutoresetMode.SAME_STEP)
-    rng = np.random.default_rng(5)
-    observation, _ = at_once.reset(seed=2)
-    ends = 0
-    queue = [[] for _ in range(4)]
-    for _ in range(120):
-        actions = rng.integers(0, 5, 4)
-        observation, rewards, terminated, truncated, info = at_once.step(actions)
-        done = terminated | truncated
-        for i in range(4):
-            queue[i].append((actions[i], rewards[i], done[i]))
-        if done.any():
-            assert info["_final_obs"].tolist() == info["_final_info"].tolist() == done.tolist()
-            for i in np.flatnonzero(done):
-                ends += 1
-                final = info["final_info"]
-                assert final["_total_s"][i]
-                assert final["total_s"][i] == pytest.approx(-sum(r for _, r, _ in queue[i]))
-                # What comes next is the next episode's beginning, not the end that is in final_obs.
-                assert observation["time"][i, 1] == 0.0
-                assert info["final_obs"][i]["time"][1] > 0.0 or final["parked"][i]
-                queue[i] = []
-    assert ends > 4
-
-
 def test_disabled_wants_those_that_ended_to_be_reset():
     envs = make_batch(3, "mini", max_episode_steps=2, autoreset_mode="Disabled")
     envs.reset(seed=0)
@@ -198,31 +172,6 @@ def test_a_generator_that_was_set_by_hand_is_drawn_from():
     assert times[3] == times[4] != times[5]
 
 
-def test_a_refused_action_skips_no_world():
-    single = gym.make("parkenv/Search-v2", scenario="mini")
-    single.reset(seed=0)
-    envs = make_batch(1, "mini", max_episode_steps=1)
-    envs.reset(seed=0)
-    envs.step(np.zeros(1, dtype=int))
-    with pytest.raises(InputError, match="is 9, want"):
-        envs.step(np.array([9]))
-    observation, *_ = envs.step(np.zeros(1, dtype=int))
-    np.testing.assert_array_equal(observation["time"][0], single.reset()[0]["time"])
-
-
-def test_what_is_handed_out_is_not_live_unless_asked():
-    for copy in (True, False):
-        envs = make_batch(4, "mini", copy=copy)
-        envs.reset(seed=0)
-        observation, rewards, *_ = envs.step(np.full(4, 3))
-        before = {name: value.copy() for name, value in observation.items()}, rewards.copy()
-        for action in (0, 1, 2, 3, 4):
-            envs.step(np.full(4, action))
-        same = all((observation[name] == value).all() for name, value in before[0].items())
-        assert same == copy
-        assert (rewards == before[1]).all() == copy
-
-
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
 @pytest.mark.parametrize("kept", [0, 2])
 def test_held_observations_stay_and_equal_those_that_are_overwritten(mode, kept):
@@ -248,7 +197,7 @@ def test_held_observations_stay_and_equal_those_that_are_overwritten(mode, kept)
 
     check(copied.reset(seed=1)[0], live.reset(seed=1)[0])
     done = np.zeros(8, dtype=bool)
-    for step in range(60):
+    for step in range(50):
         if mode is AutoresetMode.DISABLED and done.any():
             options = {"options": {"reset_mask": done}}
             check(copied.reset(**options)[0], live.reset(**options)[0])
@@ -259,18 +208,14 @@ def test_held_observations_stay_and_equal_those_that_are_overwritten(mode, kept)
             live.set_state(saved)
         actions = rng.integers(0, 5, 8)
         ours, theirs = copied.step(actions), live.step(actions)
-        check(ours[0], theirs[0])
+        check({**ours[0], "rewards": ours[1]}, {**theirs[0], "rewards": theirs[1]})
         done = ours[2] | ours[3]
 
 
-def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
-    scenario = make_scenario(city_lot(10_000))
+def test_a_lot_of_thousands_of_slots_touches_only_what_is_near():
+    scenario = make_scenario(city_lot(3_000))
     envs = make_batch(2, scenario, observation="local")
-    observation, _ = envs.reset(seed=0)
-    assert (
-        observation["local"].shape
-        == make_batch(2, "mini", observation="local").reset(seed=0)[0]["local"].shape
-    )
+    envs.reset(seed=0)
     rng = np.random.default_rng(0)
     for _ in range(50):
         envs.step(rng.integers(0, 4, 2))
@@ -293,30 +238,30 @@ def test_wrong_arguments_are_refused_by_name(wrong, message):
         ParkSearchVectorEnv(**({"scenario": "mini"} | wrong))
 
 
-STARTS = [
-    {"scenario": "street", "entry": 1, "arrival": "Tue 08:30"},
-    {"scenario": 0, "arrival": 86400.0 + 8.5 * 3600},
-    {"scenario": "log", "arrival": "wed 09:05"},
-    {"scenario": "mini"},
-    {},
-]
-
-
-@pytest.mark.parametrize("options", STARTS)
-def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environments_and_batches(options):
+@pytest.mark.parametrize(
+    ("options", "second"),
+    [
+        ({"scenario": "street", "entry": 1, "arrival": "Tue 08:30"}, 86400.0 + 8.5 * 3600.0),
+        ({"scenario": 0, "arrival": 86400.0 + 8.5 * 3600}, 86400.0 + 8.5 * 3600.0),
+        ({"scenario": "log", "arrival": "wed 09:05"}, 2 * 86400.0 + 9 * 3600.0 + 300.0),
+        ({"scenario": "mini"}, None),
+        ({}, None),
+    ],
+)
+def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environments_and_batches(
+    options, second
+):
     two_entries = dataclasses.replace(grid_lot(2, 8), entries=np.array([[0.0, 0.0], [30.0, 0.0]]))
     street = Scenario(name="street", lot=two_entries, occupancy=make_scenario(two_entries).occupancy)
     places = [make_scenario("mini"), street, recorded_scenario()]
-    env = gym.make("parkenv/Search-v2", scenario=places).unwrapped
-    envs = make_batch(3, places)
+    env, envs = gym.make("parkenv/Search-v2", scenario=places).unwrapped, make_batch(3, places)
     batch, _ = envs.reset(seed=7, options=options)
     for i in range(3):
         observation, info = env.reset(seed=7 + i, options=options)
         if "scenario" in options:
             assert info["scenario"] in (options["scenario"], "mini")
-        if "arrival" in options:
-            wanted = {"Tue 08:30": (1, 8.5), "wed 09:05": (2, 9 + 5 / 60)}.get(options["arrival"], (1, 8.5))
-            assert observation["time"][0] == pytest.approx(86400 * wanted[0] + 3600 * wanted[1], abs=0.1)
+        if second is not None:
+            assert observation["time"][0] == pytest.approx(second, abs=0.1)
         if "entry" in options:
             assert env.state.vertex == two_entries.entry_vertices[1]
         for key, value in observation.items():
@@ -325,6 +270,13 @@ def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environme
     later, plain = env.reset()[0], gym.make("parkenv/Search-v2", scenario=places)
     plain.reset(seed=7)
     np.testing.assert_array_equal(later["time"], plain.reset()[0]["time"], "the choice is for one episode")
+
+
+@pytest.fixture(scope="module")
+def made():
+    """A batch, and a single environment."""
+    places = ["mini", "street"]
+    return make_batch(2, places), gym.make("parkenv/Search-v2", scenario=places)
 
 
 @pytest.mark.parametrize(
@@ -342,11 +294,8 @@ def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environme
         ),
     ],
 )
-def test_a_start_that_is_none_is_refused(options, message):
-    for env in (
-        make_batch(2, ["mini", "street"]),
-        gym.make("parkenv/Search-v2", scenario=["mini", "street"]),
-    ):
+def test_a_start_that_is_none_is_refused(made, options, message):
+    for env in made:
         with pytest.raises(InputError, match=message):
             env.reset(seed=0, options=options)
 

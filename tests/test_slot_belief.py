@@ -1,12 +1,11 @@
 """The belief about slots: one law, in plain arithmetic, in the compiled environment, and in each agent's input."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from parkenv import InputError, SensorModel, make_scenario
+from parkenv import InputError
 from parkenv.belief.slot_belief import SlotBelief
 
 CHANCES = st.floats(0.0, 1.0)
@@ -36,33 +35,6 @@ def test_observed_slots_are_free_or_taken_even_where_the_forecast_was_certain():
     after = belief.update(range(6), [False, True, False, True, False, True])
     assert after.observed_free.tolist() == [True, False, True, False, True, False, False]
     assert after.observed_taken.tolist() == [False, True, False, True, False, True, False]
-
-
-@pytest.mark.parametrize("sensor_model", [SensorModel(), SensorModel(hit_rate=0.9, false_alarm_rate=0.2)])
-def test_an_observation_states_the_belief_that_the_same_reports_lead_to(sensor_model):
-    """The environment's compiled belief, as observed, decays between observations as `SlotBelief` does."""
-    scenario = make_scenario("street", sensor_model=sensor_model)
-    env = gym.make("parkenv/Search-v2", scenario=scenario)
-    observation, _ = env.reset(seed=2)
-    rng = np.random.default_rng(0)
-    belief = SlotBelief.of_observation(observation)
-    assert not belief.observed.any()
-    np.testing.assert_array_equal(belief.p_occupied, belief.forecast)
-    for _ in range(60):
-        observation, _, over, _, _ = env.step(int(rng.choice(np.flatnonzero(observation["action_mask"][:4]))))
-        now = SlotBelief.of_observation(observation)
-        apart = now.observed_at == belief.observed_at
-        expected = belief.decay(now.time - belief.time)
-        np.testing.assert_allclose(now.p_occupied[apart], expected.p_occupied[apart], atol=1e-5)
-        np.testing.assert_array_equal(now.p_occupied[now.age == 0.0], now.p_observed[now.age == 0.0])
-        if over:
-            break
-        belief = now
-    assert belief.observed_free.any()
-    assert belief.observed_taken.any()
-    exact = env.unwrapped.state.belief
-    for name in ("forecast", "p_occupied", "p_observed", "observed_at", "age"):
-        np.testing.assert_allclose(getattr(now, name), getattr(exact, name), rtol=1e-6, atol=1e-4)
 
 
 def test_parts_and_observations_keep_the_belief():

@@ -21,7 +21,7 @@ from torch.distributions import Categorical
 
 import parkenv
 from parkenv.engine.spaces import FlatLayout
-from parkenv.world.occupancy.constant_map import ConstantForecast
+from parkenv.world.occupancy.process import ConstantForecast
 
 ENVS, STEPS, EPOCHS, PARTS = 64, 16, 4, 2
 GAMMA, LAMBDA, CLIP, ENTROPY, LEARNING_RATE = 0.999, 0.95, 0.2, 0.01, 2e-3

@@ -177,11 +177,15 @@ class DayBelief:
 
     def p_occupied(self, time: float) -> FloatArray:
         """P(taken) of each slot at a time, s since the search began, (n_slots,), observed or not."""
-        p: FloatArray = _p_occupied(
-            self._log_weight, self._p_taken, self._forecast, self._decay_rate,
-            self._p_then, self._observed_at, time,
-        )  # fmt: skip
-        return p
+        return _p_occupied(  # type: ignore[no-any-return]
+            self._log_weight,
+            self._p_taken,
+            self._forecast,
+            self._decay_rate,
+            self._p_then,
+            self._observed_at,
+            time,
+        )
 
 
 def _hypotheses(
@@ -216,7 +220,6 @@ def _hypotheses(
 
 
 def _shifts(levels: FloatArray, slopes: FloatArray, nearness: FloatArray) -> FloatArray:
-    """Return the shifts of all slots, (n_slots, n_slopes * n_levels) logits, on days with these levels and slopes."""
     return np.asarray((levels + nearness[:, None, None] * slopes[:, None]).reshape(len(nearness), -1))
 
 

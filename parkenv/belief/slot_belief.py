@@ -23,24 +23,15 @@ _SURELY_LEFT = 8.0  # decay rate times age up to which something of an observati
 
 
 class Observations(NamedTuple):
-    """Observations of some slots, (k,) each.
+    """Observations of some slots, (k,) each."""
 
-    Attributes:
-        slots: int64.
-        time: float64, when each was observed, s since the search began.
-        taken: bool, observed states.
-        hit_rate: float64, P(observed taken | taken).
-        false_alarm_rate: float64, P(observed taken | free).
-    """
-
-    slots: IntArray
-    time: FloatArray
-    taken: BoolArray
-    hit_rate: FloatArray
-    false_alarm_rate: FloatArray
+    slots: IntArray  # int64
+    time: FloatArray  # float64, when each was observed, s since the search began
+    taken: BoolArray  # bool, observed states
+    hit_rate: FloatArray  # float64, P(observed taken | taken)
+    false_alarm_rate: FloatArray  # float64, P(observed taken | free)
 
     def take(self, slots: NDArray[np.integer]) -> Observations:
-        """Return the observations of some slots, (n,), numbered by their position among these."""
         which, number = _places(self.slots, slots)
         _, time, taken, hit_rate, false_alarm_rate = self
         return Observations(number, time[which], taken[which], hit_rate[which], false_alarm_rate[which])
@@ -159,12 +150,6 @@ class SlotBelief:
         return Observations(*_read_observations(self.step_observed, self.parts))
 
     @cached_property
-    def _step_observed(self) -> FloatArray:
-        """(4, k) float64, the used part of `step_observed`."""
-        rows = self.step_observed.reshape(4, -1)
-        return rows[:, : np.count_nonzero(rows[0] >= 0.0)].astype(np.float64)
-
-    @cached_property
     def observed(self) -> BoolArray:
         """(n_slots,) bool, whether the slot was observed in this search."""
         return self.observed_at >= 0.0
@@ -225,22 +210,15 @@ class SlotBelief:
             false_alarm_rate: (k,) or scalar, P(observed taken | free).
         """
         observed = np.asarray(slots, dtype=np.int64)
+        kinds = (observed_taken, np.bool_), (hit_rate, np.float64), (false_alarm_rate, np.float64)
         reports, hits, false_alarms = (
-            np.broadcast_to(np.asarray(values, dtype=kind), observed.shape)
-            for values, kind in (
-                (observed_taken, np.bool_),
-                (hit_rate, np.float64),
-                (false_alarm_rate, np.float64),
-            )
+            np.broadcast_to(np.asarray(values, dtype=kind), observed.shape) for values, kind in kinds
         )
-        step_observed = np.hstack([self._step_observed, [observed, reports, hits, false_alarms]])
-        later = type(self)(
-            self.p_occupied.astype(np.float64),
-            self.parts.astype(np.float64),
-            self.time,
-            self.day_error,
-            step_observed.ravel(),
-        )
+        before = self.step_observed.reshape(4, -1)
+        before = before[:, : np.count_nonzero(before[0] >= 0.0)].astype(np.float64)
+        step_observed = np.hstack([before, [observed, reports, hits, false_alarms]]).ravel()
+        p_occupied, parts = self.p_occupied.astype(np.float64), self.parts.astype(np.float64)
+        later = type(self)(p_occupied, parts, self.time, self.day_error, step_observed)
         _update_slots(later.p_occupied, observed, reports, hits, false_alarms)
         later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time
         return later
@@ -272,7 +250,6 @@ def decay_to_prior(prior: float, rate: float, p_observed: float, elapsed: float)
 
 @compiled(error_model="numpy", forceinline=True)
 def bayes_update(p: float, observed_taken: bool, hit_rate: float, false_alarm_rate: float) -> float:
-    """P(taken) of a slot after one observation (Bayes' rule)."""
     if_taken = hit_rate if observed_taken else 1.0 - hit_rate
     if_free = false_alarm_rate if observed_taken else 1.0 - false_alarm_rate
     evidence = if_taken * p + if_free * (1.0 - p)
@@ -284,7 +261,6 @@ def bayes_update(p: float, observed_taken: bool, hit_rate: float, false_alarm_ra
 
 @compiled(forceinline=True)
 def observed_state(forecast: float, p_observed: float) -> int:
-    """State of an observed slot, see `SlotBelief.state`; `UNOBSERVED` if the observation changed nothing."""
     if p_observed < forecast or p_observed == 0.0:
         return OBSERVED_FREE
     if p_observed > forecast or p_observed == 1.0:

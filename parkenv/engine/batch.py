@@ -7,7 +7,9 @@ So while one search is stepped with its local observation, the data of the next 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, Self
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+from weakref import ReferenceType, ref
 
 import numpy as np
 from gymnasium import spaces
@@ -16,9 +18,15 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import LINE, int32s, int64s, prefetch, uint8s
-from parkenv.engine.belief_memory import BeliefMemory
-from parkenv.engine.kernel import arrive, init_prior, step_cost_s, sum_of_costs, take_step, write_clock
-from parkenv.engine.live_counts import observe_live
+from parkenv.engine.kernel import (
+    arrive,
+    init_prior,
+    observe_live,
+    step_cost_s,
+    sum_of_costs,
+    take_step,
+    write_clock,
+)
 from parkenv.engine.local_observation import Surroundings, local_space, observe_surroundings
 from parkenv.engine.records import N_ACTIONS, SEARCH, SENTINEL, edge_at, scenario_at, search_at
 from parkenv.engine.search_belief import refresh_belief, write_belief
@@ -28,46 +36,31 @@ from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, inlined,
 from parkenv.world.scenario import EDGE
 
 _APART = 2  # searches between two stages of loading
+_NEVER = -1
+_MOST_KEPT = 3  # beliefs, of which callers rarely hold on to more than the last two
 _SEARCH_BYTES, _EDGE_BYTES = SEARCH.itemsize, EDGE.itemsize
 
 
 class Steps(NamedTuple):
-    """The results of a step, besides observations.
+    """The results of a step, besides observations."""
 
-    Attributes:
-        rewards: (n,) float64.
-        terminated, truncated: (n,) bool.
-        mask: (n, 5) int8, the actions that are possible now.
-    """
-
-    rewards: FloatArray
-    terminated: BoolArray
+    rewards: FloatArray  # (n,) float64
+    terminated: BoolArray  # (n,) bool
     truncated: BoolArray
-    mask: NDArray[np.int8]
-
-    @classmethod
-    def of(cls, n: int, mask: NDArray[np.int8]) -> Self:
-        """Return the initial results of n searches whose masks are an array of the observations."""
-        return cls(np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), mask)
+    mask: NDArray[np.int8]  # (n, 5) int8, the actions that are possible now
 
 
 class Observer(ABC):
     """What the searches of a batch observe.
 
     Args:
-        tables: scenarios of the searches.
-        n: number of searches.
         space: of the observations of one search; has an `action_mask`.
         full_belief: whether the searches keep `p_occupied` and `belief` up to date.
         kept: names of observations that are arrays of `Searches`.
 
     Attributes:
-        searches: the searches.
-        address: of their records.
-        space: as above.
         seen: the observations by name, (n, ...) each.
-        n_bytes: memory of searches and observations, bytes.
-        table_bytes: memory of what all searches share besides `tables`, bytes.
+        n_bytes: memory of searches and observations, bytes; `table_bytes` is what all share besides the scenarios.
     """
 
     table_bytes = 0
@@ -101,7 +94,6 @@ class Observer(ABC):
         """
 
     def renew(self) -> None:
-        """Let later steps leave what `observations` returned as it is."""
         return
 
     def observations(self) -> dict[str, NDArray[Any]]:
@@ -109,21 +101,85 @@ class Observer(ABC):
         return {name: array.copy() for name, array in self.seen.items()}
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
-        """Return a copy of everything that changes as arrays of numbers, for `set_state`."""
         return tuple(array.view(np.uint8) if array.dtype.names else array for array in self.searches.save())
 
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        """Continue from a state that `get_state` returned for the same scenarios."""
         self.searches.restore(state)
 
 
-class BeliefObserver(Observer):
-    """The observations of `parkenv/Search-v2`.
+class _Beliefs:
+    """Memory of arrays of `Searches`, by name: what callers got of it, and the last step that wrote to it."""
 
-    Args:
-        tables, n: see `Observer`.
-        without: names of observations to leave out.
+    def __init__(self, like: Mapping[str, NDArray[np.float32]]) -> None:
+        # No array of numpy's: a view would refer to it instead of the array that the caller got.
+        self._memory = {name: bytearray(array.nbytes) for name, array in like.items()}
+        self.arrays = {name: self._view(name, array.shape) for name, array in like.items()}
+        for name, array in like.items():
+            self.arrays[name][...] = array
+        self.handed_out: list[ReferenceType[NDArray[Any]]] = []
+        self.step = _NEVER
+
+    def _view(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        return np.ndarray(shape, np.float32, self._memory[name])
+
+    def are_free(self) -> bool:
+        return all(array() is None for array in self.handed_out)
+
+    def hand_out(self, name: str) -> NDArray[np.float32]:
+        handed = self._view(name, (len(self.arrays[name]), self.arrays[name][0].size))
+        self.handed_out.append(ref(handed))
+        return handed
+
+
+class BeliefMemory:
+    """The memory of `p_occupied` and `belief` of some searches: what callers still hold of it stays as it is.
+
+    A step changes the belief in few slots, so copying the beliefs of all searches would take a third of its time.
     """
+
+    def __init__(self, searches: Searches) -> None:
+        self._searches = searches
+        self._now = _Beliefs({"p_occupied": searches.p_occupied, "belief": searches.belief})
+        searches.hold(**self._now.arrays)
+        self._kept = [self._now]
+        self._begun_in: IntArray = np.zeros(len(searches.records), np.int64)  # the step
+        self._step = 0
+
+    def begin(self, which: BoolArray) -> None:
+        np.copyto(self._begun_in, self._step, where=which)
+
+    def renew(self) -> bool:
+        self._now.step = self._step
+        self._step += 1
+        if self._now.are_free():
+            self._now.handed_out = []
+            return False
+        last, self._now = self._now, self._free()
+        self._searches.hold(**self._now.arrays)
+        begun = np.flatnonzero(self._begun_in > self._now.step)
+        for name, array in self._now.arrays.items():
+            array[begun] = last.arrays[name][begun]
+        return True
+
+    def forget(self) -> None:
+        self._kept = [self._now]
+
+    def hand_out(self, name: str) -> NDArray[Any]:
+        """Return the array of this name, (n, ...), which nobody changes while it, or a part of it, is held."""
+        return self._now.hand_out(name)
+
+    def _free(self) -> _Beliefs:
+        for beliefs in self._kept:
+            if beliefs.are_free():
+                beliefs.handed_out = []
+                return beliefs
+        new = _Beliefs(self._now.arrays)
+        self._kept = [*self._kept[1 - _MOST_KEPT :], new]
+        return new
+
+
+class BeliefObserver(Observer):
+    """The observations of `parkenv/Search-v2`, but for the names in `without`."""
 
     def __init__(self, tables: ScenarioRecords, n: int, without: tuple[str, ...] = ()) -> None:
         space = {k: v for k, v in space_of(tables.scenarios).items() if k not in without}
@@ -182,7 +238,6 @@ def first_wrong(actions: IntArray) -> int:
 
 @kernel
 def arrive_all(address: int, which: BoolArray) -> None:
-    """Put cars at the entries of their next worlds."""
     for e in range(len(which)):
         if which[e]:
             search = search_at(address, e)
@@ -196,7 +251,6 @@ def arrive_all(address: int, which: BoolArray) -> None:
 
 @inlined
 def advance(search: Any, e: int, action: int, fresh: bool, limit: int, steps: Steps) -> None:
-    """Step a search unless it is fresh, and write its results, and the time, which policies read, too."""
     if fresh:
         steps.rewards[e] = 0.0
         steps.terminated[e] = steps.truncated[e] = False
@@ -298,7 +352,6 @@ def _target(search: Any, action: int) -> int:
 
 @inlined
 def _prefetch_vertex(search: Any, around: Surroundings, action: int) -> None:
-    """Load the rows of the vertex that an action leads to."""
     scenario = scenario_at(search.scenario, 0)
     target = _target(search, action)
     prefetch(scenario.action_masks + target * N_ACTIONS)
@@ -315,7 +368,6 @@ def _prefetch_vertex(search: Any, around: Surroundings, action: int) -> None:
 
 @inlined
 def _prefetch_lists(search: Any, around: Surroundings, action: int) -> None:
-    """Load the lists of slots in view of, and near, that vertex."""
     scenario = scenario_at(search.scenario, 0)
     target = _target(search, action)
     first = int64s(scenario.view_starts)[target]
@@ -327,7 +379,6 @@ def _prefetch_lists(search: Any, around: Surroundings, action: int) -> None:
 
 @inlined
 def _prefetch_slots(search: Any, around: Surroundings, action: int) -> None:
-    """Load what is known of these slots and of the remembered one."""
     scenario = scenario_at(search.scenario, 0)
     first, remembered = around.first[search.scenario_index], search.remembered_slot
     prefetch(around.crow_s.ctypes.data + 16 * (first + remembered))

@@ -12,6 +12,10 @@ search ends.
 A car that manoeuvres, or stands, blocks the vertex where it is. A car that would reach a blocked vertex waits before
 it, and blocks the vertex that it comes from, so queues grow backwards. Cars that leave soon show it by their lights; a
 car that stands before such a slot holds it against others, until it drives on.
+
+What a car is told counts as observations of its own, so every agent uses it unchanged. Reports from before a car's
+arrival count as observations at its arrival, decayed to it; those that have lost half of their value by then are
+ignored. Which slot a guidance system has reserved for it, a car reads from its observation (`parkenv.engine.fleet`).
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.slot_belief import decay_to_prior
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.keyed_random import car_key
@@ -45,17 +50,18 @@ from parkenv.engine.kernel import (
     give_up,
     init_prior,
     observe,
+    publish_count,
     sum_of_costs,
     write_clock,
 )
-from parkenv.engine.knowledge import clear_live_map, inform, report_slot, report_view
-from parkenv.engine.live_counts import publish_count
 from parkenv.engine.policy import LEAVE, TAKE_SLOT
 from parkenv.engine.records import (
     BALKED,
     BLOCK,
     BLOCK_BITS,
+    BLOCK_SIZE,
     CAR,
+    FULL_KNOWLEDGE,
     GAVE_UP,
     LEFT,
     N_ACTIONS,
@@ -66,20 +72,33 @@ from parkenv.engine.records import (
     RESERVE_KNOWLEDGE,
     SEARCH,
     SEARCHING,
+    SHARED_KNOWLEDGE,
     SHARED_SLOT,
     SLOT,
     TRUNCATED,
+    block_at,
     car_at,
     counted_at,
     fleet_at,
+    live_slot_at,
+    report_at,
     scenario_at,
     search_at,
     shared_slot_at,
+    slot_at,
     step_at,
 )
-from parkenv.engine.search_belief import refresh_belief
-from parkenv.engine.shared_slots import empty_shared_slots, leaves_soon
+from parkenv.engine.search_belief import (
+    add_observed,
+    column_of,
+    empty_shared_slots,
+    is_taken,
+    leaves_soon,
+    refresh_belief,
+    set_belief_of,
+)
 from parkenv.world.lot import PARK
+from parkenv.world.occupancy.decay import decay_factor
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
 from parkenv.world.scenario import EDGE
 
@@ -94,7 +113,115 @@ _MANY_STEPS = 64  # cars on their way, from which on their data does not stay in
 _SEARCH_AT = int(CAR.fields["search"][1])  # type: ignore[index]
 CAR_BYTES, SEARCH_BYTES, SLOT_BYTES = CAR.itemsize, SEARCH.itemsize, SLOT.itemsize
 BLOCK_BYTES, SHARED_BYTES, EDGE_BYTES = BLOCK.itemsize, SHARED_SLOT.itemsize, EDGE.itemsize
+_HALF_LIFE = 0.6931471805599453
 _ON_TICK = 1e-9  # fraction of a tick
+
+
+@kernel
+def clear_live_map(fleet: Any) -> None:
+    for slot in range(fleet.n_slots):
+        live_slot_at(fleet.live_map, slot).time = -np.inf
+    fleet.first_report = fleet.n_reports = 0
+    fleet.reservations_stale = True
+
+
+# ---- shared information
+
+
+@kernel
+def report_view(fleet: Any, search: Any) -> None:
+    scenario, columns = scenario_at(search.scenario, 0), int32s(search.columns)
+    viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
+    hit_rate, false_alarm_rate = float64s(scenario.hit_rate), float64s(scenario.false_alarm_rate)
+    for i in range(starts[search.vertex], starts[search.vertex + 1]):
+        column = np.int64(columns[viewed[i]])
+        record = slot_at(search.slots, column)
+        block, k = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+        # What the driver may not use counts as taken for it, but not for others.
+        if record.observed and block.observed_at[k] == search.time and record.valid_until < np.inf:
+            taken, p = bool(record.observed_taken), block.p_observed[k]
+            report_slot(fleet, viewed[i], taken, hit_rate[i], false_alarm_rate[i], p)
+
+
+@kernel
+def report_slot(
+    fleet: Any, slot: int, taken: bool, hit_rate: float, false_alarm_rate: float, p: float
+) -> None:
+    if fleet.delay_s == 0.0:
+        _write(live_slot_at(fleet.live_map, slot), fleet.time, taken, hit_rate, false_alarm_rate, p)
+        return
+    last = report_at(fleet.reports, (fleet.first_report + fleet.n_reports) % fleet.report_capacity)
+    last.slot = slot
+    _write(last, fleet.time, taken, hit_rate, false_alarm_rate, p)
+    fleet.n_reports += 1
+
+
+@inlined
+def _write(report: Any, time: float, taken: bool, hit_rate: float, false_alarm_rate: float, p: float) -> None:
+    report.time, report.taken, report.p = time, taken, p
+    report.hit_rate, report.false_alarm_rate = hit_rate, false_alarm_rate
+
+
+@inlined
+def _update_map(fleet: Any) -> None:
+    while fleet.n_reports > 0:
+        first = report_at(fleet.reports, fleet.first_report)
+        if first.time > fleet.time - fleet.delay_s:
+            break
+        live = live_slot_at(fleet.live_map, first.slot)
+        _write(live, first.time, first.taken, first.hit_rate, first.false_alarm_rate, first.p)
+        fleet.first_report = (fleet.first_report + 1) % fleet.report_capacity
+        fleet.n_reports -= 1
+
+
+# ---- what a car takes over
+
+
+@kernel
+def inform(fleet: Any, number: int) -> None:
+    car = car_at(fleet.cars, number)
+    search = search_at(car.search, 0)
+    if car.knows == SHARED_KNOWLEDGE:
+        _update_map(fleet)
+        _inform_by_map(fleet, car, search)
+    elif car.knows == FULL_KNOWLEDGE:
+        search.n_step_observed = 0
+        for slot in range(fleet.n_slots):
+            column = column_of(search, slot)
+            taken = is_taken(search, column, fleet.time)
+            set_belief_of(search, column, taken, 1.0 if taken else 0.0, search.time)
+            add_observed(search, slot, taken, 1.0, 0.0)
+
+
+@inlined
+def _inform_by_map(fleet: Any, car: Any, search: Any) -> None:
+    since, until = car.informed_until, fleet.time - fleet.delay_s
+    for slot in range(fleet.n_slots):
+        live = live_slot_at(fleet.live_map, slot)
+        if live.time < since or live.time == -np.inf:
+            continue
+        column = column_of(search, slot)
+        if slot_at(search.slots, column).valid_until == np.inf:
+            continue  # The driver may not park there, whatever others say.
+        block, k = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+        hit_rate, false_alarm_rate = live.hit_rate, live.false_alarm_rate
+        if live.time >= search.arrival:
+            if slot_at(search.slots, column).observed and live.time <= block.observed_at[k]:
+                continue
+            set_belief_of(search, column, live.taken, live.p, live.time)
+        else:
+            age_s, prior, rate = search.arrival - live.time, block.prior[k], block.decay_rate[k]
+            if slot_at(search.slots, column).observed or age_s * rate >= _HALF_LIFE:
+                continue
+            set_belief_of(
+                search, column, live.taken, decay_to_prior(prior, rate, live.p, age_s), search.arrival
+            )
+            # What the report says about a slot that may have changed since.
+            kept, mean = decay_factor(rate * age_s), prior * hit_rate + (1.0 - prior) * false_alarm_rate
+            contrast = (hit_rate - false_alarm_rate) * kept
+            hit_rate, false_alarm_rate = mean + contrast * (1.0 - prior), mean - contrast * prior
+        add_observed(search, slot, live.taken, hit_rate, false_alarm_rate)
+    car.informed_until = until
 
 
 # ---- from Python
@@ -133,14 +260,10 @@ def _stand(fleet: Any, number: int) -> None:
 
 @kernel
 def advance_at(address: int, until: float) -> int:
-    """Carry out events and the decisions of compiled policies.
+    """Carry out events and the decisions of compiled policies of a FLEET record until a time, s since Monday 00:00.
 
-    Args:
-        address: address of the FLEET record.
-        until: s since Monday 00:00, time to stop at; infinite: stop when all searches are over.
-
-    Returns:
-        The car whose decision, or the end of whose search, Python must handle; or a negative number, see `FINISHED`.
+    With an infinite time, until all searches are over. Returns the car whose decision, or the end of whose search,
+    Python must handle; or a negative number, see `FINISHED`.
     """
     fleet = fleet_at(address, 0)
     while True:
@@ -180,7 +303,6 @@ def act_at(address: int, action: int) -> None:
 
 @kernel
 def release_at(address: int) -> None:
-    """Remove the car whose search is over from the head of the queue, and free its SEARCH record."""
     fleet = fleet_at(address, 0)
     number = _first_ready(fleet)
     _free_search(fleet, car_at(fleet.cars, number))
@@ -200,7 +322,6 @@ def init_forecast_at(address: int) -> None:
 
 @inlined
 def _is_due(fleet: Any, time: float) -> bool:
-    """Return whether the next event is not after a time, s; there must be one, if that is infinite."""
     return bool(min(_next_arrival(fleet), _next_departure(fleet), _next_end(fleet)) <= time)
 
 
@@ -236,7 +357,6 @@ def _next_event(fleet: Any) -> int:
 
 @inlined
 def _prefetch_next(fleet: Any) -> None:
-    """Load what the next steps need: in a town, much of the time would be waiting for memory."""
     cars = int32s(fleet.step_cars)
     for i in range(3, 7):
         prefetch(fleet.cars + CAR_BYTES * np.int64(cars[i]) + _SEARCH_AT)
@@ -259,7 +379,6 @@ def _prefetch_next(fleet: Any) -> None:
 
 @inlined
 def _next_arrival(fleet: Any) -> float:
-    """Return when the next car arrives, infinite if none does; s since Monday 00:00, as below."""
     return float(car_at(fleet.cars, fleet.next_car).arrival if fleet.next_car < fleet.n_cars else np.inf)
 
 
@@ -270,7 +389,6 @@ def _next_departure(fleet: Any) -> float:
 
 @inlined
 def _next_end(fleet: Any) -> float:
-    """Return when the next step of a car is over, infinite if no car is on its way."""
     return float(float64s(fleet.step_times)[0] if fleet.n_steps_to_end > 0 else np.inf)
 
 
@@ -296,7 +414,6 @@ def _rank(fleet: Any, number: int) -> None:
 
 @inlined
 def _heap(fleet: Any, times: int, cars: int) -> tuple[FloatArray, NDArray[np.int32], IntArray]:
-    """Return a heap of events, whose arrays have these addresses: times, cars, the order of equal times by car."""
     n = fleet.n_cars
     return float64_array(times, (n,)), int32_array(cars, (n,)), int64_array(fleet.event_ranks, (n,))
 
@@ -414,7 +531,6 @@ def _depart(fleet: Any, number: int) -> None:
 
 @kernel
 def act(fleet: Any, number: int, action: int) -> bool:
-    """Carry out the decision of the first car in the queue; returns whether there is such an action."""
     car = car_at(fleet.cars, number)
     search = search_at(car.search, 0)
     if not (LEAVE <= action < N_ACTIONS or TAKE_SLOT <= action < TAKE_SLOT + fleet.n_slots):
@@ -457,7 +573,10 @@ def act(fleet: Any, number: int, action: int) -> bool:
         release_slot(fleet, car)
     _add_end(fleet, search.time, number)
     if fleet.step_capacity > 0:
-        _keep_step(fleet, search, number, origin)
+        step = step_at(fleet.steps, fleet.n_kept_steps)
+        step.car, step.begin, step.end = number, fleet.time, search.time
+        step.origin, step.vertex, step.failed = origin, search.vertex, search.step_failed_s > 0.0
+        fleet.n_kept_steps += 1
     return True
 
 
@@ -484,14 +603,6 @@ def _enter_facility(fleet: Any, car: Any, search: Any, number: int) -> None:
     if fleet.tick_s > 0.0:
         _round_up(fleet, search)
     _add_end(fleet, search.time, number)
-
-
-@inlined
-def _keep_step(fleet: Any, search: Any, number: int, origin: int) -> None:
-    step = step_at(fleet.steps, fleet.n_kept_steps)
-    step.car, step.begin, step.end = number, fleet.time, search.time
-    step.origin, step.vertex, step.failed = origin, search.vertex, search.step_failed_s > 0.0
-    fleet.n_kept_steps += 1
 
 
 @inlined
@@ -563,7 +674,6 @@ def clear_lanes(fleet: Any) -> None:
 
 @inlined
 def block_lane(fleet: Any, vertex: int, until: float, number: int) -> None:
-    """Block a vertex for other cars until a time, s, if cars block lanes."""
     if fleet.manoeuvre_s > 0.0:
         at = int64s(fleet.junction_of_vertex)[vertex]
         if until > float64s(fleet.blocked_until)[at]:

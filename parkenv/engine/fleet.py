@@ -15,26 +15,23 @@ from scipy.optimize import linear_sum_assignment
 from parkenv.compiled.jit import entry_point
 from parkenv.compiled.keyed_random import world_key
 from parkenv.engine import events
-from parkenv.engine.fleet_cars import FleetCars
-from parkenv.engine.fleet_observer import ObservedFleet
-from parkenv.engine.fleet_options import DriverKind, FleetOptions
+from parkenv.engine.fleet_cars import DriverKind, FleetCars, FleetOptions
+from parkenv.engine.fleet_memory import FleetMemory
 from parkenv.engine.records import NO_SLOT, RESERVE_KNOWLEDGE, SEARCH, SEARCHING, STATES
 from parkenv.engine.spaces import action_number
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import Demand, TownDemand
-from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, draw_arrival
-from parkenv.world.occupancy.process import Arrival
-from parkenv.world.occupancy.python_functions import raise_error
+from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, draw_arrival, hour_of_week
+from parkenv.world.occupancy.process import Arrival, raise_error
 from parkenv.world.scenario import drive_times
-from parkenv.world.week_hours import hour_of_week
 
 __all__ = ["DriverKind", "Fleet", "FleetOptions"]
 
 _UNREACHABLE_S = 1e9
 
 
-class Fleet(ObservedFleet):
+class Fleet(FleetMemory):
     """Many cars in one lot, driven by compiled policies, by agents in Python, or by both.
 
     Every car is a search as in `parkenv/Search-v2`, with the same actions, observations and costs; its forecast is that
@@ -162,15 +159,10 @@ class Fleet(ObservedFleet):
                 k = getattr(agent, "local_k", None)  # models observe `local`
                 observation = self.observation(car) if k is None else self.local_observation(car, k)
                 action, states[car] = agent.predict(observation, states.get(car))
+                self.act(action)
             except (Exception, SystemExit) as error:
                 raise InputError(
                     f"car {car}: its agent raised {type(error).__name__} at {self.time - self.begin:.1f} s: {error}"
-                ) from error
-            try:
-                self.act(action)
-            except InputError as error:
-                raise InputError(
-                    f"car {car}: its agent at {self.time - self.begin:.1f} s: {error}"
                 ) from error
             if self._states[car] != SEARCHING:
                 states.pop(car, None)
@@ -201,7 +193,7 @@ class Fleet(ObservedFleet):
             if status == events.NEEDS_RESERVATIONS:
                 self._reserve_slots()
             else:
-                self.serve_request(status)
+                self._requests[status]()
 
     def ready_cars(self) -> list[int]:
         """Return the cars that are to decide, or whose end Python has not handled yet, now, in their order."""
@@ -222,7 +214,6 @@ class Fleet(ObservedFleet):
         events.release_at(self.address)
 
     def _reserve_slots(self) -> None:
-        """Assign free slots to the searching cars of the guidance system, at the least total time."""
         cars = self.cars
         members = np.flatnonzero((cars["state"] == SEARCHING) & (cars["knows"] == RESERVE_KNOWLEDGE))
         room = np.clip(self.scenario.lot.capacity - self.counts(), 0, len(members))

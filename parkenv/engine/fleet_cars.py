@@ -1,18 +1,21 @@
-"""The cars of a fleet's world, as its demand draws them."""
+"""The options of a fleet, its kinds of drivers, and the cars of its world, as its demand draws them."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field, InstanceOf
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.keyed_random import SLOT_STREAM, car_uniforms
-from parkenv.engine.fleet_options import FleetOptions
-from parkenv.engine.records import CAR, DUE, NO_CAR
-from parkenv.errors import InputError
+from parkenv.engine.policy import CompiledPolicy
+from parkenv.engine.records import BACKGROUNDS, CAR, DUE, NO_CAR
+from parkenv.errors import InputError, require_one_of
+from parkenv.files.field_types import NotNegative, Validated, Whole
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.world.demand import CarPlans, Demand, TownDemand
 from parkenv.world.occupancy.process import ArrivalDay
@@ -23,15 +26,79 @@ _TAKEN_BEFORE = 0.8
 """Chance that a free slot was taken when a car came that is parked at first: it stands in the first slot that was not.
 A counted facility that has room had room."""
 _MOST_PASSED = 30
+TIMES = ("tick_s", "delay_s", "manoeuvre_s", "leaving_soon_s")
+"""Options that are times, s, and fields of the FLEET record."""
+
+
+@dataclass(frozen=True)
+class DriverKind(Validated):
+    """A kind of driver in a fleet.
+
+    Args:
+        weight: relative number of such drivers. A car's kind follows from its own random number, so with two kinds and
+            equal demand, the drivers of the first kind stay the same, and more join them, as its weight grows.
+        policy: compiled policy that decides, such as `planners.heuristics.policies.POLICIES["greedy-drive"]`; None:
+            Python decides.
+        knows: what these drivers know of the slots besides the forecast: `own`, their own observations; `shared`, also
+            those on the live map; `reserve`, the slot that a guidance system has reserved for them; `full`, the true
+            state of every slot.
+        shares: whether they report their observations, and that they park and leave, to the live map.
+
+    Raises:
+        InputError: a value out of its range; the message names the field.
+    """
+
+    weight: NotNegative = 1.0
+    policy: InstanceOf[CompiledPolicy] | None = None
+    knows: str = "own"
+    shares: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_one_of("knows", self.knows, KNOWLEDGE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetOptions(Validated):
+    """Options of a fleet; `parkenv.engine.fleet.Fleet` describes what they change.
+
+    Args:
+        drivers: the kinds of drivers.
+        background: other cars that take slots: `residents`, which are parked when the world begins, drawn from the
+            scenario's occupancy, and leave once; `process`, the scenario's occupancy all day; `none`: the lot is
+            empty when the world begins. By default residents; none if cars of the demand are parked then.
+        max_steps: limit of a car's decisions; by default that of `parkenv/Search-v2`.
+        leave_full_lot: whether a car gives up once it knows every slot to be taken; otherwise it searches on until its
+            patience is at an end. An informed car knows it at once, so compare kinds of knowledge with False.
+        tick_s: durations of steps, and arrivals, are rounded up to multiples of this, s; 0: continuous time.
+        delay_s: time after which a report is on the live map, s.
+        manoeuvre_s: time for which a car that parks or leaves blocks its lane, s; 0: no car blocks a lane.
+        leaving_soon_s: time for which cars signal that they are about to leave, s.
+        sees_cars: whether observations hold the other cars in view.
+
+    Raises:
+        InputError: a value out of its range; the message names the field.
+    """
+
+    drivers: Annotated[tuple[InstanceOf[DriverKind], ...], Field(min_length=1)] = (DriverKind(),)
+    background: str | None = None
+    max_steps: Annotated[Whole, Field(ge=1)] = 2000
+    leave_full_lot: bool = True
+    tick_s: NotNegative = 0.0
+    delay_s: NotNegative = 0.0
+    manoeuvre_s: NotNegative = 0.0
+    leaving_soon_s: NotNegative = 0.0
+    sees_cars: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not sum(kind.weight for kind in self.drivers) > 0.0:
+            raise InputError("drivers: all weights are 0, want one above 0")
+        require_one_of("background", self.background, (None, *BACKGROUNDS))
 
 
 class FleetCars:
-    """The cars of the present world.
-
-    Args:
-        scenario: the scenario, with the demand's weights of entries and goals.
-        demand: the demand of all worlds.
-        options: the options of the fleet.
+    """The cars of the present world, of a scenario with the demand's weights of entries and goals.
 
     Attributes:
         scenarios: one for each goal with a weight.
@@ -72,7 +139,6 @@ class FleetCars:
         return np.where(np.isfinite(way_s), way_s, 0.0)
 
     def draw(self, demand: Demand | TownDemand, key: np.uint64, arrival_s: float, day: ArrivalDay) -> float:
-        """Draw the cars of the world with this key, see `Demand.draw`; return when it begins, s since Monday 00:00."""
         plans, options = demand.draw(key, arrival_s, len(self._entries), day), self._options
         self.midnight = midnight = day.weekday * DAY_S
         begin = midnight + demand.begin_s(arrival_s)
@@ -112,7 +178,6 @@ class FleetCars:
         return Drivers(cars["stay_s"], cars["arrival"], value_of_time, classes, plans.kwh)
 
     def zone_costs(self) -> FloatArray:
-        """Return what parking in each zone costs each car, (n_cars, n_zones) s; see `SearchProblem.zone_cost_s`."""
         return self._scenario.zone_cost_s(self.drivers)
 
     def drivers_of(self, cars: Any) -> Drivers:

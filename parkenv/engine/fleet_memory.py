@@ -1,37 +1,42 @@
-"""Memory of a fleet: the records that the compiled engine works on."""
+"""Memory of a fleet: the records that the compiled engine works on, and the observations of its cars."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from parkenv.compiled.memory import address_of, sparse_zeros
 from parkenv.engine import events, records
-from parkenv.engine.fleet_cars import FleetCars
-from parkenv.engine.fleet_options import TIMES, FleetOptions
-from parkenv.engine.records import CAR, FLEET, REPORT, SEARCH, STEP
+from parkenv.engine.fleet_cars import TIMES, FleetCars, FleetOptions
+from parkenv.engine.kernel import read_step, step_result_at
+from parkenv.engine.local_observation import FIRST_NEAR, PER_NEAR, Surroundings, observe_surroundings_at
+from parkenv.engine.records import CAR, FLEET, REPORT, SEARCH, SEARCHING, STATES, STEP, UNGUIDED
+from parkenv.engine.search_belief import shared_slots_taken_at
 from parkenv.engine.searches import ScenarioRecords, Searches, most_observed_in
-from parkenv.engine.shared_slots import shared_slots_taken_at
-from parkenv.world.lot import ParkingLot
+from parkenv.engine.spaces import space_of
+from parkenv.errors import InputError
+from parkenv.world.lot import PARK, ParkingLot
 from parkenv.world.occupancy.kernel import SHARED_KIND
 
 _FIRST_CHUNK = 16
+_MOST_SEEN = 127  # cars at a vertex, as observed
+
+
+class StepOutcome(NamedTuple):
+    begun: bool  # whether there was a step: not before the first decision
+    reward: float
+    info: dict[str, Any]  # see `parkenv/Search-v2`
 
 
 class FleetMemory:
-    """The FLEET record, and the arrays that it points to.
-
-    Args:
-        drawn: the cars as the demand draws them.
-        options: the options of the fleet.
+    """The FLEET record, the arrays that it points to, and what cars observe.
 
     Attributes:
         scenarios: the scenarios of the cars, one for each goal with a weight; see `cars["scenario_index"]`.
-        record: the FLEET record.
-        address: its address, for compiled code.
         world: address of the occupancy that the background is drawn from; 0 if Python makes it.
         arrays: by field of the record, the array that it points to.
         slots: (n_slots,) of the dtype SHARED_SLOT.
@@ -93,17 +98,18 @@ class FleetMemory:
             events.NEEDS_REPORTS: self._grow_reports,
             events.NEEDS_STEPS: self._grow_steps,
         }
+        self._is_guided = any(kind.knows == "reserve" for kind in self.drivers)
+        self._copy_masks = [mask.copy for mask in scenarios[0].graph_masks]
+        self._surroundings: dict[int, Surroundings] = {}
         if options.delay_s > 0.0:
             self._grow_reports()
 
     def _point_to(self, **arrays: NDArray[Any]) -> None:
-        """Keep arrays alive, and write their addresses into the fields of the record."""
         self.arrays |= arrays
         for name, array in arrays.items():
             self.record[name] = address_of(array, array.dtype)
 
     def hold_cars(self, cars: NDArray[np.void], zone_cost_s: NDArray[np.float64] | None) -> None:
-        """Point to the cars of a world; no car has a search."""
         self.cars, n = cars, len(cars)
         # Looking up fields takes a tenth of a decision in Python.
         self._states, self._vertices, self._addresses = cars["state"], cars["vertex"], cars["search"]
@@ -123,10 +129,6 @@ class FleetMemory:
         )
         for searches in self._pool:
             self._add_free(searches)
-
-    def serve_request(self, status: int) -> None:
-        """Serve a request of the compiled engine, a negative status of `advance_at`."""
-        self._requests[status]()
 
     def _add_free(self, searches: Searches) -> None:
         first, n = int(self.record["n_free"]), len(searches.records)
@@ -156,20 +158,21 @@ class FleetMemory:
         searches.complete_arrival(row)
         events.init_forecast_at(self.address)
 
+    def _grow(self, name: str, dtype: np.dtype[Any], least: int, first: int = 0) -> None:
+        """Double the room of an array of records, a ring that begins at an index."""
+        old = self.arrays.get(name, np.zeros(0, dtype))
+        grown = np.zeros(max(2 * len(old), least), dtype)
+        grown[: len(old)] = np.roll(old, -first)
+        self._point_to(**{name: grown})
+        self.record[f"{name[:-1]}_capacity"] = len(grown)
+
     def _grow_reports(self) -> None:
-        first, n = int(self.record["first_report"]), int(self.record["n_reports"])
-        old = self.arrays.get("reports", np.zeros(0, REPORT))
-        reports = np.zeros(2 * max(len(old), 2 * len(self.slots), 1024), REPORT)
-        reports[:n] = np.roll(old, -first)[:n]
-        self._point_to(reports=reports)
-        self.record["first_report"], self.record["report_capacity"] = 0, len(reports)
+        least = max(4 * len(self.slots), 2048)
+        self._grow("reports", REPORT, least, int(self.record["first_report"]))
+        self.record["first_report"] = 0
 
     def _grow_steps(self) -> None:
-        old = self.arrays.get("steps", np.zeros(0, STEP))
-        steps = np.zeros(max(2 * len(old), 4096), STEP)
-        steps[: len(old)] = old
-        self._point_to(steps=steps)
-        self.record["step_capacity"] = len(steps)
+        self._grow("steps", STEP, 4096)
 
     def keep_steps(self) -> None:
         """From now on, keep the steps of all cars; `steps` returns those of the present world."""
@@ -178,7 +181,6 @@ class FleetMemory:
 
     @property
     def steps(self) -> NDArray[np.void]:
-        """Steps of all cars since `keep_steps`, (n,) of the dtype STEP, in order of their beginning."""
         return self.arrays.get("steps", np.zeros(0, STEP))[: int(self.record["n_kept_steps"])].copy()
 
     def take_steps(self) -> NDArray[np.void]:
@@ -188,31 +190,25 @@ class FleetMemory:
         return steps
 
     def search_of(self, address: int) -> np.void:
-        """Return the SEARCH record at an address, a live view."""
         searches, row = self._rows[int(address)]
-        record: np.void = searches.records[row]
-        return record
+        return searches.records[row]  # type: ignore[no-any-return]
 
     def taken(self) -> NDArray[np.bool_]:
-        """Return whether each slot is taken now, (n_slots,)."""
         taken = np.zeros(len(self.slots), np.bool_)
         shared_slots_taken_at(self.address, float(self.record["time"]), taken)
         return taken
 
     def counts(self) -> NDArray[np.int64]:
-        """Return how many cars are in each slot now, (n_slots,): at most 1, but for counted facilities."""
         counts, counted = self.taken().astype(np.int64), self.arrays["counted"]["n_cars"]
         counts[len(counts) - len(counted) :] = counted
         return counts
 
     @property
     def begin(self) -> float:
-        """When the world began, s since Monday 00:00."""
         return float(self.record["arrival"])
 
     @property
     def time(self) -> float:
-        """The time now, s since Monday 00:00."""
         return float(self.record["time"])
 
     @property
@@ -225,9 +221,97 @@ class FleetMemory:
 
     @property
     def n_bytes(self) -> int:
-        """Memory of cars, slots and searches, bytes, without the tables of the scenario."""
         arrays = [*self.arrays.values(), *self._moves]
         return sum(array.nbytes for array in arrays) + sum(searches.n_bytes for searches in self._pool)
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        space, lot = space_of(self.scenarios, self._most_observed), self.scenarios[0].lot
+        further: dict[str, spaces.Space[Any]] = {}
+        if self._is_guided:
+            further["reserved"] = spaces.Box(-1, 1, (lot.n_slots,), np.int8)
+        if self.options.leaving_soon_s > 0.0:
+            further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
+        if self.scenarios[0].has_rules:
+            further["driver"] = spaces.Box(0.0, np.inf, (6,), np.float64)
+        if self.options.sees_cars:
+            further["cars"] = spaces.Box(0, _MOST_SEEN, (2, lot.n_vertices), np.int8)
+        return spaces.Dict(dict(space.items()) | further)
+
+    def observation(self, car: int) -> dict[str, Any]:
+        address, vertex = self._search_of(car), self._vertices[car]
+        time, p_occupied, belief, step_observed, day_error = self.copiers[address]
+        observation = {
+            "vertex": vertex,
+            "time": time(),
+            "p_occupied": p_occupied(),
+            "belief": belief(),
+            "step_observed": step_observed(),
+            "day_error": day_error(),
+            "action_mask": self._mask(car, vertex),
+        }
+        if self._is_guided:
+            reserved = self.search_of(address)["reserved"]
+            own = np.arange(len(self.slots)) == reserved
+            observation["reserved"] = own.astype(np.int8) - np.int8(reserved == UNGUIDED)
+        if self.options.leaving_soon_s > 0.0:
+            observation["leaving"] = self._leaving_in_view(int(vertex))
+        if self.scenarios[0].has_rules:
+            driver = *self.drawn.drivers_of(car), self.cars["walks"][car]
+            observation["driver"] = np.array(driver, np.float64)
+        if self.options.sees_cars:
+            observation["cars"] = self._cars_in_view(car, int(vertex))
+        return observation
+
+    def local_observation(self, car: int, k: int = 5) -> dict[str, Any]:
+        """Return the `local` observation of a searching car, with k slots; to be called once at each of its decisions.
+
+        `parkenv.engine.local_observation` describes it.
+        """
+        address = self._search_of(car)
+        if k not in self._surroundings:
+            self._surroundings[k] = Surroundings.of(self.scenarios, k)
+        local = np.empty(FIRST_NEAR + PER_NEAR * k, np.float32)
+        observe_surroundings_at(address, self._surroundings[k], local)
+        return {"local": local, "action_mask": self._mask(car, self._vertices[car])}
+
+    def outcome(self, car: int) -> StepOutcome:
+        address = self._search_of(car)
+        scenario = self.scenarios[self.cars["scenario_index"][car]]
+        reward, _, _, info = read_step(scenario.name, step_result_at(address))
+        return StepOutcome(bool(self.search_of(address)["n_steps"]), reward, info)
+
+    def _search_of(self, car: int) -> int:
+        address = int(self._addresses[car])
+        if address == 0:
+            state = STATES[self.cars["state"][car]]
+            raise InputError(f"car {car} is {state}, want one that searches")
+        if address not in self.copiers:
+            raise InputError("observations are kept only if a kind of driver has no policy")
+        return address
+
+    def _mask(self, car: int, vertex: int) -> NDArray[np.int8]:
+        mask: NDArray[np.int8] = self._copy_masks[vertex]()
+        if mask[PARK] and self.drawn.zone_cost_s is not None:
+            mask[PARK] = np.isfinite(self.drawn.zone_cost_s[car, self.scenarios[0].lot.zone_of_slot[vertex]])
+        return mask
+
+    def _leaving_in_view(self, vertex: int) -> NDArray[np.int8]:
+        slots = self.slots
+        leaving, viewed = np.zeros(len(slots), np.int8), self.scenarios[0].in_view(vertex)
+        left_s = slots["leaves_at"][viewed] - self.record["time"]
+        leaving[viewed] = (left_s > 0.0) & (left_s <= self.options.leaving_soon_s)
+        return leaving
+
+    def _cars_in_view(self, car: int, vertex: int) -> NDArray[np.int8]:
+        cars, lot = self.cars, self.scenarios[0].lot
+        others = cars["state"] == SEARCHING
+        others[car] = False
+        at, stands = cars["vertex"][others], cars["stands"][others]
+        away = lot.vertex_xy[at] - lot.vertex_xy[vertex]
+        near = np.hypot(*away.T) <= self.scenarios[0].sensor_model.view_range
+        counts = [np.bincount(at[which], minlength=lot.n_vertices) for which in (near, near & stands)]
+        return np.minimum(counts, _MOST_SEEN).astype(np.int8)
 
 
 def _counted(lot: ParkingLot) -> NDArray[Any]:

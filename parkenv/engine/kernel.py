@@ -7,6 +7,7 @@ Functions named `..._at` take an address: that of a record of `Searches`, where 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,10 @@ from parkenv.compiled.keyed_random import (
     keyed_uniform,
 )
 from parkenv.compiled.memory import float32s, float64s, int32s, int64s
-from parkenv.engine.live_counts import observe_live
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
+    FORECAST,
     N_ACTIONS,
     N_TERMS,
     NO_SLOT,
@@ -35,15 +36,18 @@ from parkenv.engine.records import (
     SENTINEL,
     UNGUIDED,
     block_at,
+    counted_at,
     edge_at,
     scenario_at,
     search_at,
+    shared_world_at,
     slot_at,
 )
 from parkenv.engine.search_belief import (
     apply_observation,
     belief_now,
     column_of,
+    forecast_of,
     init_full_prior,
     is_forbidden,
     is_taken,
@@ -57,9 +61,16 @@ from parkenv.engine.search_belief import (
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy import kernel as worlds
-from parkenv.world.occupancy.kernel import EXTERNAL_KIND, LOG_KIND, PROCESS_KIND, inlined, kernel
+from parkenv.world.occupancy.kernel import (
+    EXTERNAL_KIND,
+    LOG_KIND,
+    PROCESS_KIND,
+    SHARED_KIND,
+    hour_of_week,
+    inlined,
+    kernel,
+)
 from parkenv.world.week import DAY_S
-from parkenv.world.week_hours import hour_of_week
 
 STEP_RESULT = ("reward", *REWARD_TERMS, *METRICS, "over", "vertex")
 """Names of the numbers that a step returns; metrics are those of the episode so far."""
@@ -84,6 +95,9 @@ def read_step(scenario: str, result: tuple[Any, ...]) -> tuple[float, bool, int,
     return reward, over, vertex, info
 
 
+_LOGISTIC = 1.702  # the logistic law of z times this is closest to the normal one
+_SURE = 8.0  # standard deviations beyond which a facility is surely full, or not
+_ABOVE = 1e-3  # how far above its forecast a facility is at least whose count says that it is full
 SCENARIO_BYTES = SCENARIO.itemsize
 _DAY_BYTES = worlds.RECORDED_DAY.itemsize
 
@@ -92,7 +106,6 @@ _DAY_BYTES = worlds.RECORDED_DAY.itemsize
 
 @kernel
 def begin_search_at(address: int) -> None:
-    """Begin the next episode; an external prior must then be queried and `init_prior` called."""
     search = search_at(address, 0)
     arrive(search)
     write_clock(search)
@@ -102,7 +115,6 @@ def begin_search_at(address: int) -> None:
 
 @kernel
 def init_external_forecast_at(address: int) -> None:
-    """Initialise the belief with the forecast in `Searches.external_forecast`."""
     init_prior(search_at(address, 0))
 
 
@@ -111,24 +123,20 @@ def init_external_forecast_at(address: int) -> None:
 
 @kernel
 def step_exact_at(address: int, action: int) -> tuple[Any, ...]:
-    """Take a valid action with an exact sensor; returns as `step_result`."""
     search = search_at(address, 0)
     drive_or_park(search, action)
     if not search.parked:
         observe_exact(search)
-    result: tuple[Any, ...] = complete_step(search)
-    return result
+    return complete_step(search)  # type: ignore[no-any-return]
 
 
 @kernel
 def step_noisy_at(address: int, action: int) -> tuple[Any, ...]:
-    """Take a valid action with a noisy sensor, or live counts; returns as `step_result`."""
     search = search_at(address, 0)
     drive_or_park(search, action)
     if not search.parked:
         observe_otherwise(search)
-    result: tuple[Any, ...] = complete_step(search)
-    return result
+    return complete_step(search)  # type: ignore[no-any-return]
 
 
 # ---- the parts of a step from Python, for environments that drive or observe differently
@@ -141,7 +149,6 @@ def act_at(address: int, action: int) -> None:
 
 @kernel
 def set_step_time_at(address: int, begin: float, drive_s: float, failed_s: float) -> None:
-    """Set the times, s, for driving and for failed attempts, of the step that began at `begin`."""
     search = search_at(address, 0)
     search.time = begin + (drive_s + failed_s)
     search.step_drive_s, search.step_failed_s = drive_s, failed_s
@@ -174,7 +181,6 @@ def apply_observations_at(
 
 @kernel
 def set_taken_at(address: int, slot: int) -> None:
-    """Set P(taken) of a slot to 1, as after a failed attempt, whatever else the step has observed of it."""
     search = search_at(address, 0)
     set_belief(search, column_of(search, slot), True, 1.0)
     if search.step_observed == 0:
@@ -191,16 +197,12 @@ def set_taken_at(address: int, slot: int) -> None:
 
 @kernel
 def finish_step_at(address: int) -> tuple[Any, ...]:
-    """Add the step to the episode and update the full belief; returns as `step_result`."""
-    result: tuple[Any, ...] = complete_step(search_at(address, 0))
-    return result
+    return complete_step(search_at(address, 0))  # type: ignore[no-any-return]
 
 
 @kernel
 def step_result_at(address: int) -> tuple[Any, ...]:
-    """Return the numbers named by `STEP_RESULT` of the last step, without changing anything."""
-    result: tuple[Any, ...] = step_result(search_at(address, 0))
-    return result
+    return step_result(search_at(address, 0))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -223,12 +225,10 @@ def read_belief_at(
 
 @inlined
 def complete_step(search: Any) -> tuple[Any, ...]:
-    """Add the step to the episode, update belief and observed time; returns as `step_result`."""
     finish_step(search)
     refresh_belief(search)
     write_clock(search)
-    result: tuple[Any, ...] = step_result(search)
-    return result
+    return step_result(search)  # type: ignore[no-any-return]
 
 
 @inlined
@@ -240,13 +240,12 @@ def step_result(search: Any) -> tuple[Any, ...]:
     terms = to_fixed_tuple(search.step_costs, N_TERMS)
     for term in range(N_TERMS):
         terms = tuple_setitem(terms, term, -search.step_costs[term])
-    result: tuple[Any, ...] = (
+    return (  # type: ignore[no-any-return]
         (-step_cost_s(search),) + terms + to_fixed_tuple(search.costs, N_TERMS) + (  # noqa: RUF005 - for numba
             sum_of_costs(search), search.driven_m, search.walked_m, search.failed_parks, search.slots_passed,
             search.parked, search.over, search.vertex,
         )
     )  # fmt: skip
-    return result
 
 
 @inlined
@@ -259,7 +258,6 @@ def step_cost_s(search: Any) -> float:
 
 @kernel
 def arrive(search: Any) -> None:
-    """Begin a search in the scenario and the world of its seed and episode, without observations."""
     key = episode_key(search.seed_state, search.episode)
     search.scenario_index = int(keyed_uniform(key, SCENARIO_STREAM, 0, 0) * search.n_scenarios)
     if search.chosen_scenario > 0:
@@ -332,7 +330,6 @@ def clear_slots(search: Any) -> None:
 
 @inlined
 def take_step(search: Any, action: int) -> None:
-    """Do everything in a step that does not depend on the sensor; its costs go to the fields `step_*`."""
     drive_or_park(search, action)
     if not search.parked:
         observe(search)
@@ -341,7 +338,6 @@ def take_step(search: Any, action: int) -> None:
 
 @inlined
 def write_clock(search: Any) -> None:
-    """Write the observed time: s since Monday 00:00, and since the search began."""
     search.clock[0], search.clock[1] = search.time, search.time - search.arrival
 
 
@@ -385,7 +381,6 @@ def clear_step(search: Any) -> None:
 
 @inlined
 def finish_step(search: Any) -> None:
-    """Add the step to the episode; give up if every slot was last observed taken."""
     scenario = scenario_at(search.scenario, 0)
     full = search.n_last_observed_taken == scenario.n_slots and scenario.leave_full_lot
     search.step_gave_up_s = scenario.give_up_s if full else 0.0
@@ -396,7 +391,6 @@ def finish_step(search: Any) -> None:
 
 @inlined
 def give_up(search: Any) -> None:
-    """End a search after a step: the car parks elsewhere, at the give-up penalty."""
     penalty = scenario_at(search.scenario, 0).give_up_s
     search.step_gave_up_s += penalty
     search.gave_up_s += penalty
@@ -424,7 +418,6 @@ def observe(search: Any) -> None:
 
 @kernel
 def observe_otherwise(search: Any) -> None:
-    """Observe the slots in view with a noisy sensor, or with live counts beside."""
     if scenario_at(search.scenario, 0).n_live == 0:
         observe_noisy(search)
         return
@@ -490,12 +483,79 @@ def observe_noisy(search: Any) -> None:
 
 @kernel
 def mark_passed(search: Any) -> None:
-    """Count the slot that the car stops at, once per search."""
     if search.vertex < scenario_at(search.scenario, 0).n_slots:
         record = slot_at(search.slots, column_of(search, search.vertex))
         if not record.passed:
             record.passed = True
             search.slots_passed += 1
+
+
+# ---- live counts of facilities, as observations of a search
+
+
+@kernel
+def observe_live(search: Any) -> None:
+    """Take in the live counts of facilities; those in view are known exactly.
+
+    A full facility is an observation of a taken slot, another one of a free slot, with P(full) on arrival there. Where
+    that is above the forecast although there is room, the forecast rises to it.
+    """
+    scenario, live = scenario_at(search.scenario, 0), int64s(scenario_at(search.scenario, 0).live)
+    for i in range(scenario.n_live):
+        slot = live[i]
+        column = column_of(search, slot)
+        record, k = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
+        block = block_at(search.blocks, column >> BLOCK_BITS)
+        in_view = record.observed and block.observed_at[k] == search.time
+        if in_view or (search.n_forbidden > 0 and is_forbidden(search, slot)):
+            continue
+        if scenario.world_kind != SHARED_KIND:
+            taken = is_taken(search, column, search.time)
+            set_belief(search, column, taken, 1.0 if taken else 0.0)
+            continue
+        world = shared_world_at(search.world, 0)
+        counted = counted_at(world.counted, slot - world.first_counted)
+        publish_count(counted, search.time)
+        age_s = search.time - counted.period * counted.delay_s if counted.delay_s > 0.0 else 0.0
+        n_vertices = scenario.n_vertices
+        ahead_s = age_s + float64s(scenario.live_drive_s)[n_vertices * i + search.vertex]
+        forecast, _ = forecast_of(search, slot)
+        p = p_full(forecast, counted.published, counted.capacity, scenario.turnover * ahead_s)
+        taken = counted.published >= counted.capacity
+        block.prior[k] = forecast if taken else max(forecast, p)
+        if search.belief != 0:
+            float32s(search.belief)[FORECAST * search.width + slot] = block.prior[k]
+        set_belief(search, column, taken, max(p, forecast + _ABOVE * (1.0 - forecast)) if taken else p)
+
+
+@kernel
+def p_full(forecast: float, count: float, capacity: float, age: float) -> float:
+    """Return P(a counted facility is full) some time, `age` mean stays, after its count was taken.
+
+    Each car leaves at rate 1 and new ones come as fast as they would fill the facility on average, so the count
+    reverts to its mean: it is binomial of what stays, e^-age, plus Poisson of what has come. Its law is taken as
+    normal, and the normal one as logistic (error below 0.01); the mean is the one at which a facility is full as often
+    as the forecast says. At age 0 the count decides, and in the long run the forecast.
+    """
+    forecast = min(max(forecast, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY)
+    z = math.log(forecast / (1.0 - forecast)) / _LOGISTIC
+    root = 0.5 * (z + math.sqrt(z * z + 4.0 * (capacity - 0.5)))
+    stay = math.exp(-age)
+    mean = count * stay + root * root * (1.0 - stay)
+    variance = (1.0 - stay) * (count * stay + root * root)
+    above = mean - capacity + 0.5
+    if variance <= 0.0 or abs(above) > _SURE * math.sqrt(variance):
+        return 1.0 if above > 0.0 else 0.0
+    return 1.0 / (1.0 + math.exp(-_LOGISTIC * above / math.sqrt(variance)))
+
+
+@inlined
+def publish_count(counted: Any, time: float) -> None:
+    """Publish the count of a facility as of the last time when that was due; call before it changes."""
+    if counted.delay_s == 0.0:
+        counted.published = counted.n_cars
+    elif math.floor(time / counted.delay_s) > counted.period:
+        counted.published, counted.period = counted.n_cars, math.floor(time / counted.delay_s)
 
 
 @inlined

@@ -63,7 +63,7 @@ from parkenv.engine.records import (
 )
 from parkenv.engine.search_belief import add_column, column_of, decay_belief, forecast_of, set_belief_of
 from parkenv.engine.searches import ScenarioRecords, Searches
-from parkenv.errors import InputError
+from parkenv.errors import require_whole
 from parkenv.world.lot import MOVES
 from parkenv.world.occupancy.kernel import PROCESS_KIND, inlined, kernel, prefetch_forecast
 from parkenv.world.scenario import SearchProblem
@@ -110,7 +110,6 @@ class Surroundings(NamedTuple):
 
     @property
     def n_numbers(self) -> int:
-        """Length of the observation, 46 + 8k."""
         return FIRST_NEAR + PER_NEAR * (self.columns.size // (N_MOVES + 1))
 
     @property
@@ -124,8 +123,7 @@ class Surroundings(NamedTuple):
         Raises:
             InputError: k is not a whole number from 1 to `MAX_SLOTS`.
         """
-        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= MAX_SLOTS:
-            raise InputError(f"k is {k!r}, want a whole number from 1 to {MAX_SLOTS:,}")
+        require_whole("k", k, least=1, most=MAX_SLOTS)
         parts = [_around(problem, int(k)) for problem in problems]
         joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
         first = np.concatenate([[0], np.cumsum([p.lot.n_vertices for p in problems])[:-1]])
@@ -175,18 +173,14 @@ class FollowedSearch:
         self._search = Searches(ScenarioRecords(public), 1, full_belief=False)
         self._n_numbers = FIRST_NEAR + PER_NEAR * int(k)
 
-    def begin(self, observation: Mapping[str, Any], scenario: int = 0) -> dict[str, NDArray[Any]]:
-        """Return the local observation at the beginning of a search for the problem of an index."""
-        self._search.begin_outside(scenario, observation)
-        return self._follow(observation, True)
-
-    def observe(self, observation: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        return self._follow(observation, False)
-
-    def _follow(self, observation: Mapping[str, Any], begins: bool) -> dict[str, NDArray[Any]]:
+    def observe(self, observation: Mapping[str, Any], begins: int | None = None) -> dict[str, NDArray[Any]]:
+        """Return the local observation; `begins` is the index of the problem whose search begins with this one."""
+        if begins is not None:
+            self._search.begin_outside(begins, observation)
         local = np.empty(self._n_numbers, np.float32)
         parts = (observation[name] for name in ("time", "p_occupied", "belief", "step_observed"))
-        follow_at(self._search.address, self._around, begins, int(observation["vertex"]), *parts, local)
+        vertex = int(observation["vertex"])
+        follow_at(self._search.address, self._around, begins is not None, vertex, *parts, local)
         return {"local": local, "action_mask": observation["action_mask"]}
 
 
@@ -202,7 +196,6 @@ def follow_at(
     step_observed: NDArray[np.float32],
     local: NDArray[np.float32],
 ) -> None:
-    """Bring a search to the state that an observation tells of, and write its local observation."""
     search, n, most = search_at(address, 0), p_occupied.size, step_observed.size // 4
     if begins:
         enter(search, np.uint64(0), 0, 0.0, 0.0, vertex)
@@ -298,7 +291,6 @@ def _write_local(search: Any, around: Surroundings, local: NDArray[np.float32]) 
 
 @inlined
 def _p_occupied(search: Any, column: int) -> float:
-    """P(taken) of the slot of a column, as last computed; 0 or 1 where a guidance system reserves slots."""
     if search.reserved != UNGUIDED:
         return 0.0 if slot_at(search.slots, column).slot == search.reserved else 1.0
     p = block_at(search.blocks, column >> BLOCK_BITS).p_occupied[column & (BLOCK_SIZE - 1)]
@@ -334,7 +326,6 @@ def _squashed(seconds: float) -> float:
 
 @inlined
 def _crow_s(around: Surroundings, one: int, other: int) -> float:
-    """Straight-line drive between two vertices, s."""
     dx = around.crow_s[one, 0] - around.crow_s[other, 0]
     dy = around.crow_s[one, 1] - around.crow_s[other, 1]
     return math.sqrt(dx * dx + dy * dy)
@@ -342,7 +333,6 @@ def _crow_s(around: Surroundings, one: int, other: int) -> float:
 
 @kernel
 def _forecast_regions(search: Any, around: Surroundings, lot: int) -> None:
-    """Average the forecast of a few slots in each quarter of the lot."""
     scenario = scenario_at(search.scenario, 0)
     if scenario.prior_kind == PROCESS_KIND:
         for region in range(N_REGIONS):
@@ -358,7 +348,6 @@ def _forecast_regions(search: Any, around: Surroundings, lot: int) -> None:
 
 @inlined
 def _remember(search: Any, around: Surroundings, lot: int) -> None:
-    """Remember the best slot observed free, and drop it when it is observed taken; or the one that is reserved."""
     if search.reserved != UNGUIDED:
         search.remembered_slot = search.reserved
         return
@@ -386,7 +375,6 @@ def _remember(search: Any, around: Surroundings, lot: int) -> None:
 
 
 def _view_s(problem: SearchProblem) -> NDArray[np.float32]:
-    """Straight-line drive plus walk for each slot in view of each vertex, row by row, s."""
     starts, slots = problem.slots_in_view
     viewer = np.repeat(np.arange(problem.lot.n_vertices), np.diff(starts))
     away = problem.lot.vertex_xy[slots] - problem.lot.vertex_xy[viewer]
@@ -432,7 +420,6 @@ def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
 
 
 def _in_lines(parts: Sequence[NDArray[Any]], dtype: type[np.generic]) -> NDArray[Any]:
-    """Put the rows of several arrays beside each other; each row fills whole cache lines."""
     rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1).astype(dtype)
     return np.pad(rows, ((0, 0), (0, -rows.shape[1] % (LINE // rows.itemsize))))
 

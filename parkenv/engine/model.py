@@ -40,7 +40,7 @@ from parkenv.engine.records import CAR, FLEET, N_ACTIONS, NO_SLOT, SEARCH, scena
 from parkenv.engine.search_belief import column_of, end_observed, is_taken, set_belief_of
 from parkenv.engine.searches import ScenarioRecords, Searches, most_observed_in
 from parkenv.engine.spaces import action_number
-from parkenv.errors import InputError, require_whole
+from parkenv.errors import InputError, require, require_whole
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import DayError, nearness
@@ -58,27 +58,19 @@ _SAME_TIME_S = 0.01
 
 
 class Observation(NamedTuple):
-    """What a step tells.
+    """What a step tells."""
 
-    Attributes:
-        vertex: where the car is.
-        time: s since the search began.
-        slots: (k,) int64, the observed slots: first the one that the car attempted to park in, if it did.
-        taken: (k,) bool, what was observed.
-        hit_rate, false_alarm_rate: (k,) float64, P(observed taken | taken) and P(observed taken | free); 1 and 0 of an
-            attempt.
-    """
-
-    vertex: int
-    time: float
+    vertex: int  # where the car is
+    time: float  # s since the search began
+    # (k,) int64, the observed slots: first the one that the car attempted to park in, if it did
     slots: IntArray
-    taken: BoolArray
+    taken: BoolArray  # (k,) bool, what was observed
+    # (k,) float64, P(observed taken | taken) and P(observed taken | free); 1 and 0 of an attempt
     hit_rate: FloatArray
     false_alarm_rate: FloatArray
 
     @classmethod
     def of(cls, observation: Mapping[str, Any] | Observation) -> Observation:
-        """Return what an observation of `parkenv/Search-v2` tells of the last step."""
         if isinstance(observation, Observation):
             return observation
         slots, _, taken, *rates = SlotBelief.of_observation(observation).observations
@@ -87,23 +79,14 @@ class Observation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What the driver knows; `Model.update` returns a new one.
+    """What the driver knows; `Model.update` returns a new one."""
 
-    Attributes:
-        vertex: where the car is.
-        slots: P(taken) of each slot, and when it was observed.
-        day: posterior over the level and the slope of the day.
-        last_taken: (n_slots,) bool, whether the slot was last observed taken.
-        arrival: when the search began, s since Monday 00:00.
-        n_steps: number of steps so far.
-    """
-
-    vertex: int
-    slots: SlotBelief
-    day: DayBelief
-    last_taken: BoolArray
-    arrival: float
-    n_steps: int
+    vertex: int  # where the car is
+    slots: SlotBelief  # P(taken) of each slot, and when it was observed
+    day: DayBelief  # posterior over the level and the slope of the day
+    last_taken: BoolArray  # (n_slots,) bool, whether the slot was last observed taken
+    arrival: float  # when the search began, s since Monday 00:00
+    n_steps: int  # number of steps so far
     _days: _Days
     _tables: ScenarioRecords
 
@@ -118,10 +101,8 @@ class _Days(NamedTuple):
 
     @classmethod
     def of(cls, error: DayError) -> _Days:
-        (levels, level_p, level_width), (slopes, slope_p, slope_width) = (
-            _cells(error.level, _LEVELS),
-            _cells(error.slope, _SLOPES),
-        )
+        levels, level_p, level_width = _cells(error.level, _LEVELS)
+        slopes, slope_p, slope_width = _cells(error.slope, _SLOPES)
         weight = np.outer(level_p, slope_p).ravel()
         level, slope = (axis.ravel() for axis in np.meshgrid(levels, slopes, indexing="ij"))
         return cls(weight, level, slope, (level_width, slope_width))
@@ -140,9 +121,6 @@ class Simulations:
     """Simulated searches in worlds of their own, stepped by compiled code; `Model.sample` makes them.
 
     They are as a particle filter or a tree search wants them: `take` copies some, `reseed` gives them another future.
-
-    Attributes:
-        searches: the searches.
     """
 
     def __init__(self, tables: ScenarioRecords, n: int) -> None:
@@ -154,28 +132,19 @@ class Simulations:
 
     @property
     def over(self) -> BoolArray:
-        over: BoolArray = self.searches.records["over"].copy()
-        return over
+        return self.searches.records["over"].copy()
 
     def observation(self, i: int = 0) -> Observation:
         rows, record = self.searches.step_observed[i], self.searches.records[i]
-        k = int(record["n_step_observed"])
-        slots, taken, *rates = rows[:, :k].astype(np.float64)
+        slots, taken, *rates = rows[:, : int(record["n_step_observed"])].astype(np.float64)
         return Observation(
             int(record["vertex"]), float(record["clock"][1]), slots.astype(np.int64), taken == 1.0, *rates
         )
 
     def step(self, actions: IntArray) -> tuple[FloatArray, BoolArray]:
-        """Take an action in each search in place; those that are over stay as they are, at no cost.
+        """Take an action, (n,) int64, in each search in place; return costs, (n,) s, and which are over, (n,) bool.
 
-        Args:
-            actions: (n,) int64.
-
-        Returns:
-            Cost of the step, (n,) s, and which searches are over, (n,) bool.
-
-        Raises:
-            InputError: an action that does not exist.
+        Those that are over stay as they are, at no cost.
         """
         actions = np.ascontiguousarray(np.broadcast_to(actions, len(self)), np.int64)
         wrong = first_wrong(actions)
@@ -199,67 +168,55 @@ class Simulations:
         return taken
 
     def reseed(self, rng: np.random.Generator) -> None:
-        """Draw again what is to come: how long states last, which slots are hidden, errors of the sensor.
-
-        What was drawn of the present stays: the day, and the slots that were asked for.
-        """
-        keys = rng.integers(2**64, size=len(self), dtype=np.uint64)
-        _reseed_at(self.searches.address, keys)
+        """Draw again how long states last, which slots are hidden, errors of the sensor; the present stays."""
+        _reseed_at(self.searches.address, rng.integers(2**64, size=len(self), dtype=np.uint64))
 
     def run(self, policy: CompiledPolicy, max_steps: int = MAX_STEPS) -> FloatArray:
-        """Let a compiled policy, such as one of `planners.heuristics.policies`, end all searches in place.
+        """Let a compiled policy end all searches in place; return the cost from now on, (n,) s.
 
-        Returns:
-            Cost from now on, (n,) s; what it is so far, where a search takes more than `max_steps`.
+        That is what it is so far, where a search takes more than `max_steps`.
         """
         cost_s = np.zeros(len(self))
         self._drive(policy, max_steps, cost_s, np.zeros(0, np.int64))
         return cost_s
 
     def choose(self, policy: CompiledPolicy) -> IntArray:
-        """Return what a compiled policy does now in each search, (n,) int64; -1 where it gives up."""
         actions = np.full(len(self), -1)
         self._drive(policy, 0, np.zeros(len(self)), actions)
         return actions
 
     def _drive(self, policy: CompiledPolicy, max_steps: int, cost_s: FloatArray, actions: IntArray) -> None:
-        if not isinstance(policy, CompiledPolicy):
-            raise InputError(
-                f"policy is {policy!r:.60}, want a CompiledPolicy, such as one of planners.heuristics.policies.POLICIES"
-            )
-        cars = _PolicyBatch(self.searches, policy)
-        _run_at(cars.address, policy.address, max_steps, cost_s, actions)
+        require(
+            isinstance(policy, CompiledPolicy),
+            f"policy is {policy!r:.60}, want a CompiledPolicy, such as one of planners.heuristics.policies.POLICIES",
+        )
+        address, _kept = _policy_batch(self.searches, policy)
+        _run_at(address, policy.address, max_steps, cost_s, actions)
 
 
 class Model:
     """The generative model of a search.
 
     Args:
-        problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept.
+        problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept. A lot with live
+            counts of facilities is refused.
         any_day: whether days may be unlike their forecast, with the probabilities of `belief` (`DayBelief`): an event
             has filled the slots near the goal, or the forecast carries no information, of the day or of single slots.
             `sample` draws all slots from such a day; their later changes follow the forecast.
-
-    Attributes:
-        problem: the public part.
-
-    Raises:
-        InputError: a lot with live counts of facilities, which the model does not have.
     """
 
     def __init__(self, problem: SearchProblem, any_day: bool = False) -> None:
         self.problem, self._any_day = problem.public(), any_day
-        if len(self.problem.live_slots):
-            raise InputError(f"lot {self.problem.lot.name!r} has live counts, want one without them")
+        require(
+            len(self.problem.live_slots) == 0,
+            f"lot {self.problem.lot.name!r} has live counts, want one without them",
+        )
 
     def initial_belief(self, observation: Mapping[str, Any]) -> Belief:
         """Return the belief in an observation of `parkenv/Search-v2`, such as the first one, that of `reset`.
 
         Of a search that goes on, the last observation of each slot counts for the day; with `update` after each step,
         all do.
-
-        Raises:
-            InputError: an observation of another lot.
         """
         seen, n = SlotBelief.of_observation(observation), self.problem.lot.n_slots
         if len(seen.p_occupied) != n:
@@ -301,12 +258,9 @@ class Model:
         p_day, p_taken = belief.day.on_days(slots, belief.slots.time)
         day = rng.choice(len(p_day), n, p=p_day)
         if not self._any_day:
-            level, slope = (
-                middle[day] + width * (rng.random(n) - 0.5)
-                for middle, width in zip(
-                    (belief._days.level, belief._days.slope), belief._days.widths, strict=True
-                )
-            )
+            days = belief._days
+            level = days.level[day] + days.widths[0] * (rng.random(n) - 0.5)
+            slope = days.slope[day] + days.widths[1] * (rng.random(n) - 0.5)
         taken = rng.random((n, len(slots))) < p_taken.T[day]
         keys, rows = rng.integers(2**64, size=n, dtype=np.uint64), np.tile(np.arange(n), copies)
         drawn = Simulations(belief._tables, n * copies)
@@ -320,19 +274,12 @@ class Model:
     def step(
         self, state: Simulations, action: int, rng: np.random.Generator | None = None
     ) -> tuple[Simulations, Observation, float, bool]:
-        """Take an action in one simulated search, and leave `state` as it is.
+        """Take an action in one simulated search, and leave `state` as it is; many are stepped by `Simulations.step`.
 
-        Args:
-            state: a simulation of `sample`; many are stepped at once by `Simulations.step`.
-            action: 0 to 4, as in `parkenv/Search-v2`.
-            rng: draws what comes anew, see `Simulations.reseed`; None: the future that was drawn with the state.
+        `rng` draws what comes anew, see `Simulations.reseed`; without it, the future is that drawn with the state.
 
         Returns:
             The next state, what is observed, the cost of the step, s, and whether the search is over.
-
-        Raises:
-            InputError: a state of another lot, of several simulations or of a search that is over; an action that does
-                not exist.
         """
         self._require_own(state)
         if len(state) != 1:
@@ -346,24 +293,14 @@ class Model:
         return after, after.observation(), float(cost_s), bool(over)
 
     def update(self, belief: Belief, action: int, observation: Mapping[str, Any] | Observation) -> Belief:
-        """Return the belief after an action and what was observed then (Bayes' rule).
-
-        Args:
-            belief: before the action.
-            action: the action.
-            observation: of the model, or of `parkenv/Search-v2`.
-
-        Raises:
-            InputError: a belief of another lot; an action that does not exist; an observation of another place than the
-                one to which the action leads.
-        """
+        """Return the belief after an action and what was observed then, in the model or the environment."""
         self._require_own(belief)
         vertex, time, slots, taken, *rates = Observation.of(observation)
         target = int(self.problem.edges["target"][belief.vertex, action_number(action)])
-        if vertex != target:
-            raise InputError(
-                f"observation is of vertex {vertex}, want {target}, to which action {action} leads"
-            )
+        require(
+            vertex == target,
+            f"observation is of vertex {vertex}, want {target}, to which action {action} leads",
+        )
         attempts = self._n_attempts(vertex, action, slots)
         times = np.full(len(slots), time)
         times[:attempts] = belief.slots.time
@@ -387,8 +324,8 @@ class Model:
     ) -> FloatArray:
         """Return how probable an observation is after an action in each simulation, (n,): weights of a particle filter.
 
-        That is the probability of what was observed of these slots. Which slots can be seen has nothing to do with
-        where cars are, and does not count; 0 where the action leads elsewhere or takes another time.
+        Which slots can be seen has nothing to do with where cars are, and does not count; 0 where the action leads
+        elsewhere or takes another time.
         """
         self._require_own(state)
         vertex, time, slots, *seen = Observation.of(observation)
@@ -398,17 +335,16 @@ class Model:
         return p
 
     def _n_attempts(self, vertex: int, action: int, slots: IntArray) -> int:
-        """Return how many of the slots, the first ones, were observed by an attempt to park, before it took time."""
         return int(action == PARK and self.problem.action_masks[vertex, PARK] == 1 and len(slots) > 0)
 
     def _require_own(self, of: Belief | Simulations) -> None:
         name = "belief" if isinstance(of, Belief) else "state"
         tables = of._tables if isinstance(of, Belief) else of.searches.scenarios
         lot, other = self.problem.lot, tables.scenarios[0].lot
-        if other is not lot:
-            raise InputError(
-                f"{name} is of lot {other.name!r} with {other.n_slots} slots, want {lot.name!r} with {lot.n_slots}"
-            )
+        require(
+            other is lot,
+            f"{name} is of lot {other.name!r} with {other.n_slots} slots, want {lot.name!r} with {lot.n_slots}",
+        )
 
 
 def model(scenario: SearchProblem, any_day: bool = False) -> Model:
@@ -434,7 +370,6 @@ def model(scenario: SearchProblem, any_day: bool = False) -> Model:
 
 
 def _last_observations(slots: SlotBelief, forecast: FloatArray) -> Observations:
-    """Return observations that lead from the forecast to what is known after the last one of each slot."""
     seen = np.flatnonzero(slots.observed)
     p, taken = slots.p_observed[seen], slots.observed_taken[seen]
     with np.errstate(divide="ignore"):
@@ -447,24 +382,20 @@ def _last_observations(slots: SlotBelief, forecast: FloatArray) -> Observations:
 # ---- compiled
 
 
-class _PolicyBatch:
-    """A car for each of some searches in one scenario, whose `moves` are the cars' from now on.
+def _policy_batch(searches: Searches, policy: CompiledPolicy) -> tuple[int, list[Any]]:
+    """Return the address of a FLEET record with a car for each search of one scenario, and what keeps it alive.
 
-    `address` is that of the FLEET record of the cars.
+    The `moves` of the searches are the cars' from now on.
     """
-
-    def __init__(self, searches: Searches, policy: CompiledPolicy) -> None:
-        n, problem = len(searches.records), searches.scenarios.scenarios[0]
-        self._cars, self._fleet = np.zeros(n, CAR), np.zeros(1, FLEET)
-        self._moves = np.zeros((n, 2 * problem.lot.n_vertices), np.uint8)
-        searches.records["moves"] = address_of(self._moves, np.uint8) + np.arange(n) * self._moves.shape[1]
-        self._cars["search"] = searches.address + np.arange(n) * SEARCH.itemsize
-        self._cars["target"] = NO_SLOT
-        self._data = policy.data_for([problem])
-        self._at = np.array([0 if self._data is None else self._data.address], np.int64)
-        self._fleet["cars"] = address_of(self._cars, CAR)
-        self._fleet["policy_data"] = address_of(self._at, np.int64)
-        self.address = address_of(self._fleet, FLEET)
+    n, problem = len(searches.records), searches.scenarios.scenarios[0]
+    cars, fleet = np.zeros(n, CAR), np.zeros(1, FLEET)
+    moves = np.zeros((n, 2 * problem.lot.n_vertices), np.uint8)
+    searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
+    cars["search"], cars["target"] = searches.address + np.arange(n) * SEARCH.itemsize, NO_SLOT
+    data = policy.data_for([problem])
+    data_at = np.array([0 if data is None else data.address], np.int64)
+    fleet["cars"], fleet["policy_data"] = address_of(cars, CAR), address_of(data_at, np.int64)
+    return address_of(fleet, FLEET), [cars, fleet, moves, data, data_at]
 
 
 @kernel

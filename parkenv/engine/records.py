@@ -114,11 +114,8 @@ _PROGRESS = [
     ("n_last_observed_taken", np.int64),
     ("n_step_observed", np.int64),  # observations of the last step in `step_observed`
     ("n_step_used", np.int64),  # entries of it that may be in use
-    (
-        "free_by_region",
-        np.float64,
-        (N_REGIONS,),
-    ),  # forecast fraction of free slots in each quarter of the lot
+    # forecast fraction of free slots in each quarter of the lot
+    ("free_by_region", np.float64, (N_REGIONS,)),
     ("remembered_slot", np.int64),  # the best slot observed free, or -1
     ("scenario_index", np.int64),  # index of the search's scenario
     ("n_forbidden", np.int64),  # slots in which the driver may not park
@@ -153,22 +150,16 @@ SEARCH = _with_costs(
         *_PROGRESS,
         *_EPISODES,
         ("scenarios", ADDRESS),  # SCENARIO records
-        (
-            "n_scenarios",
-            np.int64,
-        ),  # number of scenarios, the first ones, from which that of an episode is drawn
-        (
-            "chosen_scenario",
-            np.int64,
-        ),  # scenario, entry and day of the next episode, from 1, or 0 to draw them
+        # number of scenarios, the first ones, from which that of an episode is drawn
+        ("n_scenarios", np.int64),
+        # scenario, entry and day of the next episode, from 1, or 0 to draw them
+        ("chosen_scenario", np.int64),
         ("chosen_entry", np.int64),
         ("chosen_day", np.int64),
         ("chosen_second", np.float64),  # of that day
         ("car", np.int64),  # number of the car in its fleet, where slots are shared
-        (
-            "moves",
-            ADDRESS,
-        ),  # (2 n_vertices,) uint8 moves to the target of a compiled policy, the last one first
+        # (2 n_vertices,) uint8 moves to the target of a compiled policy, the last one first
+        ("moves", ADDRESS),
         ("reserved", np.int64),  # slot that a guidance system has reserved, `NO_SLOT`, or `UNGUIDED`
         # (n_zones,) float64, s, what the car's own stay costs, infinite where it may not park; 0: as the scenario says
         ("zone_cost_s", ADDRESS),
@@ -177,10 +168,8 @@ SEARCH = _with_costs(
         ("blocks", ADDRESS),  # BLOCK records
         ("slots", ADDRESS),  # SLOT records
         ("columns", ADDRESS),  # (n_slots,) int32
-        (
-            "external_forecast",
-            ADDRESS,
-        ),  # (2, width) float64 forecast and decay rate of an external prior, or 0
+        # (2, width) float64 forecast and decay rate of an external prior, or 0
+        ("external_forecast", ADDRESS),
         ("day_error", ADDRESS),  # (2,) float32, of the forecast
         ("world", ADDRESS),  # PROCESS, RECORDED_DAY, FUNCTIONS or SHARED_WORLD record
         ("width", np.int64),  # number of slots of the largest lot
@@ -324,10 +313,8 @@ CAR = _with_costs(
         # For compiled policies:
         ("target", np.int64),  # the target slot, or -1
         ("n_moves", np.int64),  # how many of the moves to it are left
-        (
-            "expected_s",
-            np.float64,
-        ),  # expected end of the search, walk and price included, s since its beginning
+        # expected end of the search, walk and price included, s since its beginning
+        ("expected_s", np.float64),
         ("settled", np.bool_),  # whether the target, not observed yet, was the best at the last decision
     ],
     costs=COST_FIELDS[0],
@@ -379,10 +366,8 @@ FLEET = np.dtype(
         ("n_cars", np.int64),
         ("cars", ADDRESS),  # (n_cars,) CAR, in order of arrival
         ("next_car", np.int64),  # index of the next car to arrive
-        (
-            "zone_cost_s",
-            ADDRESS,
-        ),  # (n_cars, n_zones) float64, what each car's stay costs; 0 without rules of zones
+        # (n_cars, n_zones) float64, what each car's stay costs; 0 without rules of zones
+        ("zone_cost_s", ADDRESS),
         ("n_zones", np.int64),
         ("ready", ADDRESS),  # cars to decide, in order: a ring of n_cars int64
         ("first_ready", np.int64),

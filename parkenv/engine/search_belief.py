@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
+from parkenv.compiled.arrays import BoolArray
 from parkenv.compiled.memory import float32s, float64s, int32s, int64s
 from parkenv.engine.records import (
     BLOCK_BITS,
@@ -18,14 +19,19 @@ from parkenv.engine.records import (
     DECAY_RATE,
     FORECAST,
     NEVER_OBSERVED,
+    NO_CAR,
     OBSERVED_AT,
     P_OBSERVED,
+    PROCESS_BACKGROUND,
+    RESIDENTS_BACKGROUND,
     SENTINEL,
     block_at,
+    counted_at,
     scenario_at,
+    shared_slot_at,
+    shared_world_at,
     slot_at,
 )
-from parkenv.engine.shared_slots import is_slot_open
 from parkenv.world.occupancy import kernel as worlds
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, LOG_KIND, PROCESS_KIND, SHARED_KIND, inlined, kernel
 from parkenv.world.week import WEEK_HOURS
@@ -33,7 +39,6 @@ from parkenv.world.week import WEEK_HOURS
 
 @inlined
 def parking_cost_s(search: Any, slot: int) -> float:
-    """Return what parking in a slot costs the driver, s: what the lot says, and the price of the stay."""
     scenario = scenario_at(search.scenario, 0)
     if search.zone_cost_s == 0:
         return float(float64s(scenario.parking_cost_s)[slot])
@@ -48,7 +53,6 @@ def is_forbidden(search: Any, slot: int) -> bool:
 
 @kernel
 def observe_changed(search: Any, slot: int) -> int:
-    """Observe the true state of a slot that may have changed; returns its column."""
     column: int = column_of(search, slot)
     taken = is_taken(search, column, search.time)
     set_belief(search, column, taken, 1.0 if taken else 0.0)
@@ -59,7 +63,6 @@ def observe_changed(search: Any, slot: int) -> int:
 def apply_observation(
     search: Any, column: int, taken: bool, hit_rate: float, false_alarm_rate: float
 ) -> None:
-    """Update the belief in a slot from one observation (Bayes' rule)."""
     p = bayes_update(belief_now(search, column), taken, hit_rate, false_alarm_rate)
     set_belief(search, column, taken, p)
     add_observed(search, slot_at(search.slots, column).slot, taken, hit_rate, false_alarm_rate)
@@ -88,13 +91,11 @@ def write_observed(
 
 @inlined
 def set_belief(search: Any, column: int, observed_taken: bool, p: float) -> None:
-    """Set P(taken) of a slot to `p` after an observation at the current time."""
     set_belief_of(search, column, observed_taken, p, search.time)
 
 
 @kernel
 def set_belief_of(search: Any, column: int, observed_taken: bool, p: float, time: float) -> None:
-    """Set P(taken) of a slot to `p` after an observation at a time, s, not before the arrival."""
     record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
     block = block_at(search.blocks, column >> BLOCK_BITS)
     if not record.observed:
@@ -121,7 +122,6 @@ def belief_now(search: Any, column: int) -> float:
 
 @kernel
 def refresh_belief(search: Any) -> None:
-    """Write the current belief into `p_occupied`, if it is kept; only slots with a column can have changed."""
     if search.belief == 0:
         return
     decay_belief(search)
@@ -153,7 +153,6 @@ def write_belief(search: Any) -> None:
 
 @inlined
 def end_observed(search: Any) -> None:
-    """Mark the rest of `step_observed` as unused."""
     if search.step_observed != 0:
         for n in range(search.n_step_observed, search.n_step_used):
             write_observed(search, n, -1.0, 0.0, 0.0, 0.0)
@@ -174,7 +173,6 @@ def decay_belief(search: Any) -> None:
 
 @inlined
 def column_of(search: Any, slot: int) -> Any:
-    """Return the column of a slot, a new one if it has none."""
     column = np.int64(int32s(search.columns)[slot])
     if column == SENTINEL:
         column = add_column(search, slot)
@@ -183,7 +181,6 @@ def column_of(search: Any, slot: int) -> Any:
 
 @kernel
 def add_column(search: Any, slot: int) -> int:
-    """Give a slot a column, and write its forecast there."""
     column = search.n_columns + 1
     search.n_columns = column
     int32s(search.columns)[slot] = column
@@ -203,7 +200,6 @@ def add_column(search: Any, slot: int) -> int:
 
 @inlined
 def is_taken(search: Any, column: int, time: float) -> bool:
-    """Return whether the slot of a column is taken at a time, s; times must not decrease between calls."""
     record = slot_at(search.slots, column)
     if time >= record.valid_until:
         find_state(search, record, time)
@@ -212,7 +208,6 @@ def is_taken(search: Any, column: int, time: float) -> bool:
 
 @kernel
 def find_state(search: Any, record: Any, time: float) -> None:
-    """Compute whether a slot is taken at a time beyond the known part of its sojourn."""
     scenario, slot = scenario_at(search.scenario, 0), np.int64(record.slot)
     if scenario.world_kind == SHARED_KIND:
         # Another car may change it at any time, so `valid_until` stays 0.
@@ -223,7 +218,6 @@ def find_state(search: Any, record: Any, time: float) -> None:
 
 @kernel
 def forecast_of(search: Any, slot: int) -> tuple[float, float]:
-    """Return the forecast P(taken) of a slot, and its decay rate, 1/s."""
     scenario = scenario_at(search.scenario, 0)
     if scenario.prior_kind == EXTERNAL_KIND:
         external = float64s(search.external_forecast)
@@ -264,7 +258,6 @@ def init_full_prior(search: Any) -> None:
 
 @kernel
 def _init_process_prior(search: Any) -> None:
-    """Write the forecast of all slots, vectorised, from marginals precomputed at the full hour."""
     scenario, width, hour, second = (
         scenario_at(search.scenario, 0), search.width, search.hour, search.second_of_hour,
     )  # fmt: skip
@@ -281,3 +274,66 @@ def _init_process_prior(search: Any) -> None:
             p = worlds.marginal_later(start[hour * n + slot], arrival, rate, second)
         belief[FORECAST * width + slot] = min(max(p, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY)
         belief[DECAY_RATE * width + slot] = rate
+
+
+# ---- slots that many cars share: taken by a car of the fleet, or by the background
+
+
+@kernel
+def is_shared_slot_taken(address: int, slot: int, time: float) -> bool:
+    """Return whether a slot of a SHARED_WORLD record is taken at a time, s; times must not decrease between calls."""
+    world = shared_world_at(address, 0)
+    if slot >= world.first_counted:
+        counted = counted_at(world.counted, slot - world.first_counted)
+        return bool(counted.n_cars >= counted.capacity)
+    shared = shared_slot_at(world.slots, slot)
+    if shared.car != NO_CAR:
+        return True
+    if world.background == PROCESS_BACKGROUND:
+        return bool(_background_state(world, slot, shared, time))
+    return bool(time < shared.leaves_at)
+
+
+@inlined
+def is_slot_open(address: int, slot: int, car: int, time: float) -> bool:
+    held_by = shared_slot_at(shared_world_at(address, 0).slots, slot).held_by
+    return bool(held_by in (NO_CAR, car) and not is_shared_slot_taken(address, slot, time))
+
+
+@inlined
+def leaves_soon(world: Any, slot: int, time: float, soon_s: float) -> bool:
+    leaves_at = shared_slot_at(world.slots, slot).leaves_at
+    return bool(time < leaves_at <= time + soon_s)
+
+
+@inlined
+def _background_state(world: Any, slot: int, shared: Any, time: float) -> bool:
+    if time >= shared.valid_until:
+        worlds.find_state(world.world_kind, world.world, world, slot, shared, time)
+    return bool(shared.occupied)
+
+
+@kernel
+def empty_shared_slots(address: int) -> None:
+    world = shared_world_at(address, 0)
+    worlds.begin_day(world.world_kind, world.world, world)
+    for slot in range(world.n_slots):
+        shared = shared_slot_at(world.slots, slot)
+        shared.sojourn, shared.valid_until = 0, -np.inf
+        shared.car, shared.held_by, shared.leaves_at = NO_CAR, NO_CAR, -np.inf
+        if slot >= world.first_counted:
+            counted = counted_at(world.counted, slot - world.first_counted)
+            counted.n_cars = counted.published = 0
+            counted.gate_free_at = counted.period = -np.inf
+        elif world.background == RESIDENTS_BACKGROUND and _background_state(
+            world, slot, shared, world.arrival
+        ):
+            shared.leaves_at = worlds.find_end_of_stay(
+                world.world_kind, world.world, world, slot, shared, world.arrival
+            )
+
+
+@kernel
+def shared_slots_taken_at(address: int, time: float, taken: BoolArray) -> None:
+    for slot in range(len(taken)):
+        taken[slot] = is_shared_slot_taken(address, slot, time)

@@ -51,7 +51,6 @@ class SearchRecord:
 
     @property
     def slot(self) -> str:
-        """Name of the slot in which the car has parked; else empty."""
         return self.scenario.lot.slot_ids[self.path[-1]] if self.metrics["parked"] else ""
 
     @property

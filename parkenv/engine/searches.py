@@ -51,14 +51,7 @@ _ARRAYS = (
 class ScenarioRecords:
     """Scenarios as records, and the arrays that the records point to: one set of tables for any number of searches.
 
-    Args:
-        scenarios: the scenarios; or problems without a world, whose searches can only be followed from outside.
-
-    Attributes:
-        records: (n,) of the dtype SCENARIO.
-        scenarios: the scenarios.
-        n_bytes: memory of records and arrays, bytes.
-
+    Problems without a world can stand for scenarios; their searches can only be followed from outside.
     """
 
     def __init__(self, scenarios: Sequence[Scenario] | Sequence[SearchProblem]) -> None:
@@ -84,7 +77,6 @@ class ScenarioRecords:
         self.n_bytes = self.records.nbytes + sum(array.nbytes for array in arrays.values())
 
     def _join(self) -> None:
-        """Move the tables of all scenarios into one block of memory."""
         of_models = [array for model in self._models for array in model.tables.values()]
         tables = [*self._kept, *of_models]
         copies = in_one_block(tables)
@@ -104,7 +96,6 @@ class ScenarioRecords:
         self._kept, self._models = copies, models
 
     def _keep(self, values: ArrayLike, dtype: Any) -> int:
-        """Keep an array, once if several scenarios share it, and return its address."""
         key = id(values), str(np.dtype(dtype))
         if key not in self._kept_at:
             array = np.ascontiguousarray(values, dtype)
@@ -116,7 +107,6 @@ class ScenarioRecords:
     def _write(
         self, record: np.void, fields: Sequence[tuple[str, Any, Value]], scenario: SearchProblem
     ) -> None:
-        """Write fields of a SCENARIO record; arrays are kept, and their addresses written."""
         for name, of, value_of in fields:
             value = value_of(scenario)
             if isinstance(of, list):
@@ -132,7 +122,6 @@ class ScenarioRecords:
             record["prior_kind"], record["prior"] = PROCESS_KIND, address
 
     def _address_of(self, model: PriorModel, scenario: Scenario) -> int:
-        """Keep the records of a model, once if scenarios share it, and return their address; 0 without records."""
         key = id(model), id(scenario.arrival)
         if key not in self._model_at:
             compiled = model.compiled(scenario.arrival)
@@ -167,15 +156,9 @@ class Searches:
         records: (n,) of the dtype SEARCH.
         slots: (n, m + 1) of the dtype SLOT, a column for each slot that a search has observed or queried, in order of
             first use; the first column is the sentinel. m is the number of slots of the largest lot.
-        external_forecast: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
-            (0, 2, 0).
+        external_forecast: (n, 2, m), forecast and decay rate of priors that only Python can compute; else (0, 2, 0).
         needs_python: whether an arrival is complete only after `complete_arrival`.
-        day_error: (n, 2) float32, logits, day error of each search's forecast: level and slope.
-        p_occupied: (n, m) float32, current belief in every slot; (0, 0) if not kept.
-        belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, and its time; (0, 4, 0) if
-            not kept.
-        step_observed: (n, 4, most_observed) float32, what the last step observed: slot, whether it was observed taken,
-            hit rate, false-alarm rate; slot -1 past the last; (0, 4, 0) if not kept.
+        day_error, p_occupied, belief, step_observed: as the environment observes them; empty if not kept.
     """
 
     def __init__(
@@ -223,7 +206,6 @@ class Searches:
         self.records[name] = first + np.arange(len(self.records)) * array.strides[0] if len(array) else 0
 
     def hold(self, p_occupied: Float32Array, belief: Float32Array) -> None:
-        """Use these arrays from now on, with the values that they have; of the shapes and types of the class."""
         self.p_occupied, self.belief = p_occupied, belief
         self._write_addresses("p_occupied", p_occupied)
         self._write_addresses("belief", belief)
@@ -237,30 +219,25 @@ class Searches:
         return (self.records["clock"][search].copy, *(part[search].reshape(-1).copy for part in parts))
 
     def complete_arrival(self, search: int) -> None:
-        """Add what only Python can make for a search that has just begun: its world, its forecast."""
         scenario, record = self.scenario_of(search), self.records[search]
         self._make_world(search)
         if self.scenarios.records["prior_kind"][record["scenario_index"]] != EXTERNAL_KIND:
             return
-        arrival = arrival_of(scenario, record)
-        forecast = scenario.forecast(arrival)
+        forecast = scenario.forecast(arrival_of(scenario, record))
         n = len(forecast.p_occupied)
         self.external_forecast[search, :, :n] = forecast.p_occupied, forecast.decay_rate
         self.day_error[search] = forecast.day_error.level, forecast.day_error.slope
 
     def begin_outside(self, scenario: int, observation: Mapping[str, Any]) -> None:
-        """Let the only search be one that runs elsewhere: the index of its scenario, and the forecast."""
         self.records["scenario_index"] = scenario
         self._find_scenarios()
         n = self.external_forecast.shape[2]
         self.external_forecast[0] = observation["belief"].reshape(4, -1)[[FORECAST, DECAY_RATE], :n]
 
     def scenario_of(self, search: int) -> Scenario:
-        scenario: Scenario = self.scenarios.scenarios[int(self.records["scenario_index"][search])]
-        return scenario
+        return self.scenarios.scenarios[int(self.records["scenario_index"][search])]  # type: ignore[no-any-return]
 
     def _find_scenarios(self) -> None:
-        """Write the addresses that follow from the scenarios and days."""
         index, scenarios = self.records["scenario_index"], self.scenarios.records
         self.records["scenario"] = self.records["scenarios"] + index * SCENARIO.itemsize
         by_day = (scenarios["world_kind"][index] == LOG_KIND) * self.records["day"] * RECORDED_DAY.itemsize
@@ -277,16 +254,13 @@ class Searches:
 
     @property
     def address(self) -> int:
-        """Address of the records, for compiled code; valid while this object lives."""
         return address_of(self.records, SEARCH)
 
     @property
     def n_bytes(self) -> int:
-        """Memory of the searches, bytes, without the shared tables of the scenarios."""
         return sum(array.nbytes for array in (self.records, *self._arrays().values()))
 
     def row(self, i: int) -> Searches:
-        """Return one of the searches by itself, in the same memory: what changes one changes the other."""
         single, rows = copy(self), slice(i, i + 1)
         single.records = self.records[rows]
         for name in _ARRAYS:
@@ -294,13 +268,11 @@ class Searches:
         return single
 
     def save(self, rows: IntArray | None = None) -> tuple[NDArray[Any], ...]:
-        """Return copies of everything that a search changes; of some searches, (k,), which may occur several times."""
         rows = np.arange(len(self.records)) if rows is None else rows
         parts = (self.records, *self._arrays().values())
         return tuple(array[rows] if len(array) else array.copy() for array in parts)
 
     def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
-        """Restore a copy returned by `save` of searches in the same scenarios; records may be given as bytes, uint8."""
         records, *arrays = saved
         records = records.view(SEARCH)
         width = int(records["width"][0])
@@ -330,11 +302,10 @@ def arrival_of(scenario: Scenario, record: np.void) -> Arrival:
 
 
 def choose_start(searches: Searches, index: int, episode: int, options: Mapping[str, Any]) -> None:
-    """Let the next episode of a search, with this number, begin as `options` of `reset` say; the rest is drawn.
+    """Let the next episode of a search, with this number, begin as some `START_OPTIONS` of `reset` say.
 
-    They are some of `START_OPTIONS`: `scenario`, its name or index; `entry`, index among the scenario's;
-    `arrival`, s since Monday 00:00 or a text such as "Tue 08:30", on a weekday of the scenario's; one of several such
-    days is drawn.
+    `scenario` is its name or index; `entry` an index among the scenario's; `arrival` s since Monday 00:00, or a text
+    such as "Tue 08:30", on a weekday of the scenario's. The rest, and one of several such days, is drawn.
     """
     scenarios, record = searches.scenarios.scenarios, searches.records[index]
     chosen, names = options.get("scenario", 0 if len(scenarios) == 1 else None), [s.name for s in scenarios]

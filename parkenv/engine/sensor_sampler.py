@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
 from parkenv.engine.state import SearchState
-from parkenv.errors import InputError, require_number, require_one_of, require_whole
+from parkenv.errors import require, require_number, require_one_of, require_whole
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
@@ -29,8 +29,6 @@ _SEEDS = 1 << 31
 
 
 class Station(NamedTuple):
-    """A time and a pose at which to measure."""
-
     time: float  # s since Monday 00:00
     pose: FloatArray  # (3,) x, y in m, yaw in rad, of the vehicle
     # moving cars and pedestrians around it; None: the scenario's traffic at this time, undisturbed
@@ -43,33 +41,23 @@ def make_rig(rig: str | SensorRig | None, scenario: Scenario, picture_width: int
     A rig by name has pictures of `PICTURE_WIDTH`.
     """
     rig = scenario.rig if rig is None else rig
-    if isinstance(rig, SensorRig):
-        sized, width = rig, picture_width
-    elif not isinstance(rig, str):
-        raise InputError(f"rig is a {type(rig).__name__}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
-    elif rig not in RIG_NAMES:
-        raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
-    else:
-        sized, width = SensorRig.named(rig), PICTURE_WIDTH if picture_width is None else picture_width
-        sized = sized.mirrored() if scenario.lot.left_hand else sized
+    width = picture_width
+    if not isinstance(rig, SensorRig):
+        require(rig in RIG_NAMES, f"rig is {rig!r:.60}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
+        rig, width = SensorRig.named(rig), PICTURE_WIDTH if width is None else width
+        rig = rig.mirrored() if scenario.lot.left_hand else rig
     if width is None:
-        return sized
+        return rig
     require_whole("picture_width", width, least=64)
-    return sized.resized(int(width))
+    return rig.resized(int(width))
 
 
 class SensorSampler:
     """Samples the simulated sensors of the searching car along each edge it drives.
 
     At a vertex the car is headed along the lane, between two vertices along the edge. Measurements depend only on
-    world, pose and time, not on the agent or on earlier measurements.
-
-    Args:
-        scenario: defines world and traffic.
-        rig: laser, stereo, both_sides, or any `SensorRig`; None: the scenario's.
-        weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each world.
-        captures: largest number of captures on an edge.
-        every: m, least distance between captures on an edge, except for the last one.
+    world, pose and time, not on the agent or on earlier measurements: at most `captures` on an edge, `every` m apart
+    except for the last one. Without a weather, each world draws one.
     """
 
     def __init__(
@@ -98,7 +86,6 @@ class SensorSampler:
         return self.sample(state, self._stations(state, since))
 
     def sample(self, state: SearchState, stations: Sequence[Station]) -> list[TimedCapture]:
-        """Measure in the world of a search at the given stations, oldest first; returns one capture for each."""
         scenes, weather = self._world(state)
         jobs = []
         for time, pose, movers in stations:
@@ -114,9 +101,9 @@ class SensorSampler:
         )
 
     def select_stations(self, driven: FloatArray) -> NDArray[np.int64]:
-        """Select evenly spaced points of a driven path, at most `captures` and at least `every` m apart, with the last.
+        """Return indices into `driven`, (k,) m up to each point of a path, of points to measure at, with the last one.
 
-        Returns indices into `driven`, (k,) m up to each candidate point, ascending.
+        They are evenly spaced, at most `captures`, and at least `every` m apart.
         """
         n = self._captures_on(float(driven[-1] - driven[0]))
         wanted = np.linspace(driven[0], driven[-1], n + 1)[1:-1]
@@ -149,7 +136,6 @@ class SensorSampler:
         return [*passing, stop]
 
     def _heading(self, state: SearchState) -> float:
-        """Return the heading at a vertex, rad: along the lane; at a junction that of arrival, or to a neighbour."""
         lot, vertex = self._lot, state.vertex
         if vertex < lot.n_slots:
             return float(lot.vertex_yaw[vertex])

@@ -15,7 +15,6 @@ from parkenv.world.scenario import Scenario
 
 
 def _field(name: str, kind: type) -> Any:
-    """Return a property that reads a field of the SEARCH record."""
     return property(lambda state: kind(state._record[name]))
 
 
@@ -50,14 +49,12 @@ class SearchState:
 
     @property
     def world(self) -> World:
-        """The true occupancy; queries do not change it."""
         if self._world is None or self._world[0] != self.key:
             self._world = self.key, self.scenario.occupancy.world(self.key, self.arrival)
         return self._world[1]
 
     @property
     def belief(self) -> SlotBelief:
-        """A float64 copy of the current belief about the slots."""
         forecast = self.scenario.forecast(self.arrival)
         belief = SlotBelief.of_forecast(
             forecast.p_occupied, forecast.decay_rate, (forecast.day_error.level, forecast.day_error.slope)
@@ -69,7 +66,6 @@ class SearchState:
 
     @property
     def total_s(self) -> float:
-        """Total time so far, s: the sum of all costs."""
         return float(self._record["costs"].sum())
 
     vertex = _field("vertex", int)

@@ -32,7 +32,7 @@ from parkenv.envs.drive_observation import (
     obstacle_map,
     scan_plane,
 )
-from parkenv.errors import InputError, require_number, require_one_of, reset_options
+from parkenv.errors import InputError, require, require_number, require_one_of, reset_options
 from parkenv.lots import load_lot
 from parkenv.world.lot import ParkingLot
 from parkenv.world.traffic import Traffic
@@ -190,8 +190,7 @@ length and width over the car's |
         require_number("contact_cost", contact_cost, least=0.0)
         if not isinstance(laser, bool | LaserScanner):
             raise InputError(f"laser is {laser!r:.40}, want True, False or a LaserScanner")
-        if not isinstance(traffic, Traffic | None):
-            raise InputError(f"traffic is a {type(traffic).__name__}, want a Traffic")
+        require(isinstance(traffic, Traffic | None), f"traffic is a {type(traffic).__name__}, want a Traffic")
         self.render_mode = render_mode
         self.vehicle = VehicleParameters() if vehicle is None else vehicle_of(vehicle)
         self.tasks = ParkingTasks(
@@ -221,26 +220,18 @@ length and width over the car's |
 
     @property
     def state(self) -> DriveState:
-        """State of the current episode.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
         if self._state is None:
             raise gym.error.ResetNeeded("the environment has no episode yet: call reset() first")
         return self._state
 
     @property
     def task(self) -> ParkingTask:
-        """The current task, public to agents."""
         return self.state.task
 
     def get_state(self) -> tuple[int, DriveState]:
-        """A copy of the episode's state, for `set_state`."""
         return self._episode, copy.deepcopy(self.state)
 
     def set_state(self, state: tuple[int, DriveState]) -> None:
-        """Continue from a state returned by `get_state` of an environment with the same car."""
         episode, episode_state = state
         if episode_state.task.vehicle != self.vehicle:
             raise InputError("state is of another vehicle than this environment's")
@@ -370,7 +361,6 @@ length and width over the car's |
             self._renderer = None
 
     def _enter(self, state: DriveState) -> None:
-        """Set up the collision world and the constant parts of the observation."""
         self._closed, task = False, state.task
         movers: list[tuple[ObstacleKind, FloatArray]] = []
         if self._n_movers:
@@ -398,8 +388,7 @@ length and width over the car's |
         if self.laser is not None:
             for k, outline in enumerate(outlines):
                 self._plane.replace(self._plane.n_footprints - 1 - k, outline)
-            eye = self.vehicle.at_middle(state.vehicle[:3])
-            scan = self.laser.scan(self._plane, eye, state.rng)
+            scan = self.laser.scan(self._plane, self.vehicle.at_middle(state.vehicle[:3]), state.rng)
             observation["scan"] = np.minimum(scan, np.float32(self.laser.max_range))
         if self._maps:
             observation["cars"], observation["lines"] = self._map[0].copy(), self._map[1].copy()
@@ -441,7 +430,6 @@ length and width over the car's |
 
 
 def _between(before: FloatArray, after: FloatArray, share: float) -> FloatArray:
-    """Interpolate poses, (n, 3): `share` 0 gives `before`, 1 gives `after`."""
     poses = before + share * (after - before)
     turn = after[:, 2] - before[:, 2]
     poses[:, 2] = before[:, 2] + share * (turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi)))

@@ -29,14 +29,6 @@ BOUND = 2.0 * REACH  # bound of positions in the observation, m
 def drive_observation_space(
     vehicle: VehicleParameters, laser: LaserScanner | None, *, n_movers: int, obstacle_map: bool
 ) -> spaces.Dict:
-    """The observation space of `DriveEnv`.
-
-    Args:
-        vehicle: defines the bounds of speed, steering and acceleration.
-        laser: adds `scan`.
-        n_movers: number of moving road users, rows of `movers`.
-        obstacle_map: whether to add `cars`, `lines`, `vehicle` and, with traffic, `movers`.
-    """
     fastest = max(vehicle.max_speed, vehicle.max_reverse_speed)
     goal = np.array([BOUND, BOUND, 1.0, 1.0, fastest, BOUND, BOUND], dtype=np.float32)
     strongest = max(vehicle.max_braking, vehicle.max_acceleration)
@@ -83,12 +75,6 @@ def fill_observation(
 
 
 def scan_plane(task: ParkingTask, movers: int = 0) -> ScanPlane:
-    """The scene of a laser low on the car: parked cars as footprints, kerbs and walls as walls.
-
-    Args:
-        task: defines the obstacles.
-        movers: number of rows reserved after the cars for moving outlines.
-    """
     cars = task.obstacles.only(ObstacleKind.PARKED_CAR)
     lines = task.obstacles.only(ObstacleKind.KERB, ObstacleKind.WALL)
     corners = np.zeros((len(cars) + movers, CORNERS, 2))
@@ -98,7 +84,6 @@ def scan_plane(task: ParkingTask, movers: int = 0) -> ScanPlane:
 
 
 def obstacle_map(task: ParkingTask) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """`cars` and `lines` of the observation (see `DriveEnv`), nearest first; rows beyond the space are dropped."""
     cars = np.full((MOST_CARS, CORNERS, 2), FAR, dtype=np.float32)
     lines = np.full((MOST_LINES, 2, 2), FAR, dtype=np.float32)
     parked = task.in_slot_frame(task.obstacles.only(ObstacleKind.PARKED_CAR).corners[:MOST_CARS])
@@ -122,7 +107,6 @@ def goal_errors(
 
 
 def goal_of(task: ParkingTask) -> NDArray[np.float32]:
-    """Return the desired goal of a task, (7,) float32; see `DriveEnv`."""
     turned = float(task.target[2] - task.slot[2])
     still = [0.0, 0.0, round(math.cos(turned), 9), round(math.sin(turned), 9), 0.0, *task.room.tolist()]
     return np.array(still, dtype=np.float32)
@@ -132,7 +116,6 @@ def goal_of(task: ParkingTask) -> NDArray[np.float32]:
 def goal_error(
     achieved: NDArray[np.float32], desired: NDArray[np.float32], half: FloatArray
 ) -> tuple[float, float, float]:
-    """Distance, m, angle, rad, and 1.0 if parked else 0.0, of one achieved goal."""
     dx, dy = float(achieved[0]) - float(desired[0]), float(achieved[1]) - float(desired[1])
     c, s = float(desired[2]), float(desired[3])
     cosine = float(achieved[2]) * c + float(achieved[3]) * s

@@ -48,7 +48,7 @@ class LocalObservation(
         observation, info = self.env.reset(seed=seed, options=options)
         scenarios, scenario = self.get_wrapper_attr("scenarios"), self.get_wrapper_attr("scenario")
         index = next(i for i, other in enumerate(scenarios) if other is scenario)
-        return self._followed.begin(observation, index), info
+        return self._followed.observe(observation, index), info
 
     def step(self, action: np.int64) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)

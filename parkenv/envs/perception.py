@@ -29,15 +29,8 @@ class OnboardPerception:
         detector: a detector, or its name as in `make_detector`; None: the scenario's.
 
     Attributes:
-        scenario: the scenario with the sensor model of the belief update.
-        sampler: the simulated sensors.
-        pipeline: detection, ranging and slot filter.
         results: pipeline results for the captures of the last step, oldest first.
         observation: the slots observed in the last step, and their observed states.
-
-    Raises:
-        InputError: an unknown rig, weather or detector, a rig without camera or ranging sensor, or a number outside its
-            range.
     """
 
     def __init__(
@@ -64,13 +57,7 @@ class OnboardPerception:
         self.observation = SlotObservation.none()
 
     def update_belief(self, address: int, vertex: int, captures: Sequence[TimedCapture]) -> None:
-        """Run the pipeline on the captures of a step, and update the belief with the observed slots.
-
-        Args:
-            address: address of the record of a search in this scenario.
-            vertex: current vertex of the car.
-            captures: captures on the way there, oldest first.
-        """
+        """Run the pipeline on the captures of a step, oldest first, and update the belief."""
         self.results, observed = self.pipeline.observe(captures)
         rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
         # The sensor model has rates only for slots within its range.
@@ -173,15 +160,13 @@ class SearchPerceptionEnv(SensingSearchEnv):
         return self._step_with_sensors
 
     def _step_with_sensors(self, address: int, action: int) -> tuple[Any, ...]:
-        """Apply the action, measure on the way, and update the belief from the measurements."""
         state = self._state
         act_at(address, action)
         state.extend_path()
         if not state.parked:
             captures = self._sampler.sample_step(state, self._before)
             self.perception.update_belief(address, state.vertex, captures)
-        result: tuple[Any, ...] = finish_step_at(address)
-        return result
+        return finish_step_at(address)  # type: ignore[no-any-return]
 
     def _newest(self) -> TimedCapture | None:
         return self.perception.results[-1].captured if self.perception.results else None

@@ -21,17 +21,10 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
     Attributes and methods belong to the whole batch. When an episode ends, its `info` has `terminal_observation`,
     `TimeLimit.truncated`, `episode` (return and length, as from `Monitor`, so no wrapper is needed) and the values of
     the batch's `info["final_info"]`, such as the metrics of a search. If observations have an `action_mask`,
-    sb3-contrib finds it.
-
-    Args:
-        batch: the batch, with `AutoresetMode.SAME_STEP`.
-        reward_scale: factor of the rewards; returns near one are easiest to learn.
-
-    Attributes:
-        actions: actions for the next `step_wait`.
+    sb3-contrib finds it. `reward_scale` is a factor of the rewards; returns near one are easiest to learn.
 
     Raises:
-        InputError: another mode, or a scale that is no number above 0.
+        InputError: another mode than `AutoresetMode.SAME_STEP`, or a scale that is no number above 0.
     """
 
     actions: NDArray[Any]
@@ -83,18 +76,15 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return observations, (rewards * self.reward_scale).astype(np.float32), done, infos
 
     def get_state(self) -> dict[str, Any]:
-        """Return a copy of what is under way as plain values, for `set_state`."""
         state = {"masks": self._masks, "returns": self._returns, "lengths": self._lengths}
         return {"batch": self.batch.get_state()} | {name: array.copy() for name, array in state.items()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state that `get_state` returned for the same batch."""
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self.batch.set_state(state["batch"])
         self._masks, self._returns, self._lengths = state["masks"], state["returns"], state["lengths"]
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return the action masks, (n_envs, n_actions) bool."""
         return self._masks.astype(np.bool_)
 
     def close(self) -> None:
@@ -105,11 +95,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Raise an error: environments of a batch have no attributes of their own.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Raise a NotImplementedError: environments of a batch have no attributes of their own."""
         raise NotImplementedError(f"environments of a batch share everything; {attr_name} cannot be set")
 
     def env_method(

@@ -92,7 +92,6 @@ class ScanObservation(
         return super().reset(seed=seed, options=options)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return the last scans."""
         for i in range(int(observation["count"])):
             scan = observation[self._laser][i].astype(np.float64)
             nearest = np.minimum.reduceat(scan, np.arange(SECTORS) * len(scan) // SECTORS)
@@ -103,7 +102,6 @@ class ScanObservation(
         }
 
     def _vector(self, elapsed: float) -> Any:
-        """Return the observation at a time since the search began, s."""
         (x, y, yaw), _ = self._scans[0]
         away_x, away_y = self._goal[0] - x, self._goal[1] - y
         bearing = math.atan2(away_y, away_x) - yaw

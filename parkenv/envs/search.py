@@ -29,10 +29,10 @@ from parkenv.engine.local_observation import (
 from parkenv.engine.searches import START_OPTIONS, ScenarioRecords, Searches, choose_start
 from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout, action_number, space_of
 from parkenv.engine.state import SearchState
-from parkenv.errors import InputError, require_number, require_one_of, reset_options
+from parkenv.errors import require, require_number, require_one_of, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
 from parkenv.world.lot import ACTIONS
-from parkenv.world.occupancy.python_functions import raise_error
+from parkenv.world.occupancy.process import raise_error
 from parkenv.world.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -45,8 +45,6 @@ _REBUILT = {
 
 
 class SavedSearch(NamedTuple):
-    """Saved state from `SearchEnv.get_state`: copies of everything that changes, and the path so far."""
-
     arrays: tuple[NDArray[Any], ...]
     path: list[int]
 
@@ -211,8 +209,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         require_one_of("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         require_one_of("observation", observation, OBSERVATIONS)
         require_changes((type(self),), changes)
-        if k is not None and observation != "local":
-            raise InputError(f"k is {k!r}, want None unless observation is local")
+        require(k is None or observation == "local", f"k is {k!r}, want None unless observation is local")
         require_number("reward_scale", reward_scale, above=0.0)
         self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.render_mode = render_mode
@@ -259,17 +256,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     @property
     def state(self) -> SearchState:
-        """The current episode, including the hidden occupancy; not for agents.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
         if not self._begun:
             raise gym.error.ResetNeeded("the environment has no episode yet: call reset() first")
         return self._state
 
     def get_state(self) -> SavedSearch:
-        """A copy of the episode's state, for `set_state`."""
         return SavedSearch(self.searches.save(), list(self.state.path))
 
     def set_state(self, state: SavedSearch) -> None:
@@ -341,13 +332,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._observation(vertex), reward, over, False, info
 
     def _stepper(self) -> Callable[[int, int], tuple[Any, ...]]:
-        """Return what acts and observes: (address of the search, action) -> numbers named by `STEP_RESULT`."""
         return _compiled_step(self._is_exact)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the mask of valid actions at this vertex, (5,) bool; sb3-contrib expects this name."""
-        mask: NDArray[np.bool_] = self.scenario.action_masks[self.state.vertex].astype(np.bool_)
-        return mask
+        return self.scenario.action_masks[self.state.vertex].astype(np.bool_)  # type: ignore[no-any-return]
 
     def render(self) -> Any:
         if self.render_mode is None:
@@ -412,6 +401,4 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
 @cache
 def _compiled_step(exact: bool) -> Callable[[int, int], tuple[Any, ...]]:
-    """Return the function that steps a search whose sensor is exact or not."""
-    step: Callable[[int, int], tuple[Any, ...]] = entry_point(step_exact_at if exact else step_noisy_at, 0, 0)
-    return step
+    return entry_point(step_exact_at if exact else step_noisy_at, 0, 0)  # type: ignore[no-any-return]

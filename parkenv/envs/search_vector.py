@@ -28,12 +28,12 @@ from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS
 from parkenv.engine.searches import START_OPTIONS, ScenarioRecords, choose_start
 from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout
 from parkenv.engine.state import SearchState
-from parkenv.errors import InputError, require_number, require_one_of, require_whole, reset_options
+from parkenv.errors import InputError, require, require_number, require_one_of, require_whole, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
 from parkenv.show.plurals import plural
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
-from parkenv.world.occupancy.python_functions import raise_error
+from parkenv.world.occupancy.process import raise_error
 
 if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
@@ -151,8 +151,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             known = ", ".join(m.value for m in AutoresetMode)
             raise InputError(f"autoreset_mode is {autoreset_mode!r}, want one of {known}") from None
         require_changes((type(self), ParkSearchVectorEnv), changes)
-        if k is not None and observation != "local":
-            raise InputError(f"k is {k!r}, want None unless observation is local")
+        require(k is None or observation == "local", f"k is {k!r}, want None unless observation is local")
         require_number("reward_scale", reward_scale, above=0.0)
         observer = _observer(observation, k) if isinstance(observation, str) else observation
         self.scenarios = tuple(make_scenarios(scenario, **changes))
@@ -169,7 +168,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.action_space = batch_space(self.single_action_space, n)
         self.observation_space = batch_space(self.single_observation_space, n)
         self._names = np.array([scenario.name for scenario in self.scenarios])
-        self._steps = Steps.of(n, self._seen["action_mask"])
+        over = np.zeros((2, n), np.bool_)
+        self._steps = Steps(np.zeros(n), over[0], over[1], self._seen["action_mask"])
         self._limit = max_episode_steps or np.iinfo(np.int64).max
         self._mode, self._copy = mode, copy
         self._begun = False
@@ -181,18 +181,15 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     @property
     def reward_terms(self) -> dict[str, FloatArray]:
-        """The terms of the last step's rewards, (n_envs,) each."""
         records = self._searches.records
         fields = zip(REWARD_TERMS, STEP_FIELDS, strict=True)
         return {name: records[field] * -self.reward_scale for name, field in fields}
 
     @property
     def scenario_index(self) -> IntArray:
-        """Index into `scenarios` of each search, (n_envs,)."""
         if len(self.scenarios) == 1:
             return np.zeros(self.num_envs, np.int64)  # without reading all records
-        index: IntArray = self._searches.records["scenario_index"].copy()
-        return index
+        return self._searches.records["scenario_index"].copy()
 
     @property
     def n_scenarios(self) -> int:
@@ -205,19 +202,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._searches.records["n_scenarios"] = n
 
     @property
-    def bytes_each(self) -> float:
-        """Memory of one search, bytes, after observing every slot; without the shared tables of the scenarios."""
-        return self.observer.n_bytes / self.num_envs
-
-    @property
     def table_bytes(self) -> int:
-        """Memory of the tables of all scenarios, bytes, which all searches share."""
         return self._tables.n_bytes + self.observer.table_bytes
 
     @property
     def memory_bytes(self) -> int:
-        """Memory of the batch, bytes: tables and searches, at most; what is never used takes none."""
-        return self.table_bytes + round(self.bytes_each * self.num_envs)
+        return self.table_bytes + self.observer.n_bytes
 
     def __repr__(self) -> str:
         places = plural(len(self.scenarios), "scenario")
@@ -237,16 +227,22 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             InputError: an unknown option, or a number of seeds that differs from the number of environments.
         """
         starts = reset_options(options, (*START_OPTIONS, "reset_mask"))
-        which = self._chosen(starts.pop("reset_mask", None))
+        given = starts.pop("reset_mask", None)
+        which = np.ones(self.num_envs, dtype=np.bool_) if given is None else np.asarray(given)
+        require(
+            which.shape == (self.num_envs,) and which.dtype == np.bool_,
+            f"reset_mask has shape {which.shape} and type {which.dtype}, want ({self.num_envs},) bool",
+        )
+        require(self._begun or which.all(), "reset_mask leaves out environments that have no episode yet")
         if seed is not None and not isinstance(seed, (Sequence, np.ndarray)):
             require_whole("seed", seed)
         if seed is None or isinstance(seed, (int, np.integer)):
             super().reset(seed=None if seed is None else int(seed))
         seeds = [seed] * self.num_envs if seed is None or isinstance(seed, (int, np.integer)) else list(seed)
-        if len(seeds) != self.num_envs:
-            raise InputError(
-                f"seed holds {len(seeds)} numbers, want {self.num_envs}, one for each environment"
-            )
+        require(
+            len(seeds) == self.num_envs,
+            f"seed holds {len(seeds)} numbers, want {self.num_envs}, one for each environment",
+        )
         if isinstance(seed, (int, np.integer)):
             seeds = [int(seed) + i for i in range(self.num_envs)]
         elif not self._begun and None in seeds:
@@ -275,7 +271,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._begun = False
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
-        """Return a copy of the state of all searches, for `set_state`."""
         return self.observer.get_state()
 
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
@@ -354,15 +349,13 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return tuple(self._renderers[state.scenario.name].frame(state) for state in self._states)
 
     def _arrive(self, which: BoolArray) -> None:
-        """Put the selected cars at the entries of their next worlds."""
         searches = self._searches
         arrive_all(self.observer.address, which)
         for i in np.flatnonzero(which[: len(self._states)]):
             self._states[i].path = []
-        if not searches.needs_python:
-            return
-        for i in np.flatnonzero(which):
-            searches.complete_arrival(int(i))
+        if searches.needs_python:
+            for i in np.flatnonzero(which):
+                searches.complete_arrival(int(i))
 
     def _observations(self) -> Any:
         observations = self.observer.observations() if self._copy else dict(self._seen)
@@ -371,32 +364,20 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     def _final_observations(self, done: BoolArray) -> NDArray[np.object_]:
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done):
-            last = {name: a[i].copy() for name, a in self._seen.items()}
-            final[i] = last if self._flat is None else self._flat(last)
+            final[i] = (self._flat or dict)({name: a[i].copy() for name, a in self._seen.items()})
         return final
 
     def _metrics(self, done: BoolArray) -> dict[str, Any]:
-        """Return the `info` of `SearchEnv` of the searches that have ended, with masks that say which."""
         words = np.zeros((len(_OFFSETS), self.num_envs), np.int64)
         copy_fields(self.observer.address, done, _OFFSETS, words)
         # A type of fewer bytes stands at the beginning of its eight.
         views = [words.view(dtype)[:, :: 8 // dtype.itemsize] for dtype in _TYPES]
         metrics: dict[str, Any] = {name: views[dtype][i] for i, (name, dtype) in enumerate(_METRIC_TYPES)}
         costs = words[len(METRICS) :].view(np.float64)
-        terms = dict(zip(REWARD_TERMS, np.multiply(costs, -self.reward_scale, out=costs), strict=True))
-        metrics["reward_terms"] = terms | dict.fromkeys(_WHICH_TERMS, done)
+        terms = zip(REWARD_TERMS, np.multiply(costs, -self.reward_scale, out=costs), strict=True)
+        metrics["reward_terms"] = dict(terms) | dict.fromkeys(_WHICH_TERMS, done)
         metrics["scenario"] = self._names[self.scenario_index]
         return metrics | dict.fromkeys(_WHICH, done)
-
-    def _chosen(self, given: Any) -> BoolArray:
-        mask = np.ones(self.num_envs, dtype=np.bool_) if given is None else np.asarray(given)
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
-            raise InputError(
-                f"reset_mask has shape {mask.shape} and type {mask.dtype}, want ({self.num_envs},) bool"
-            )
-        if not self._begun and not mask.all():
-            raise InputError("reset_mask leaves out environments that have no episode yet")
-        return mask
 
 
 def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int], Observer]:

@@ -14,7 +14,7 @@ from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.engine.spaces import LATEST
 from parkenv.engine.state import SearchState
 from parkenv.envs.search import SearchEnv
-from parkenv.errors import InputError, require_one_of
+from parkenv.errors import require, require_one_of
 from parkenv.scenarios.build import ScenarioSource, make_scenario, require_changes
 from sim_sensors.rig import SensorRig, TimedCapture
 
@@ -32,7 +32,6 @@ class SensingSearchEnv(SearchEnv):
 
     @property
     def rig(self) -> SensorRig:
-        """The sensors, their poses on the car, and their models."""
         return self._sampler.rig
 
     def reset(
@@ -50,7 +49,6 @@ class SensingSearchEnv(SearchEnv):
         """Return the newest capture, if any."""
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
-        """Return the lot from above, with the newest camera images beside it."""
         return with_camera_images(super()._frame(state), self._newest(), self.rig)
 
 
@@ -144,8 +142,7 @@ road users |
         super().__init__(make_scenario(scenario, **changes), render_mode, reward_scale=reward_scale)
         sensors = make_rig(rig, self.scenario, picture_width)
         if observation == "scan":
-            if not sensors.lasers:
-                raise InputError('observation is "scan", want a rig with a laser')
+            require(sensors.lasers, 'observation is "scan", want a rig with a laser')
             sensors = sensors.only_lasers()
         self._sampler = SensorSampler(self.scenario, sensors, weather, captures, every)
         self._captures: list[TimedCapture] = []

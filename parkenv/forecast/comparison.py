@@ -42,15 +42,12 @@ def _mean(parts: list[FloatArray]) -> FloatArray:
 
 
 def hour_mean(counts: Counts) -> FloatArray:
-    """Return the mean (c, d, 24) of the hour over all earlier weekdays, or weekend days."""
     result = np.full(counts.seen.shape, np.nan)
     for weekend in (False, True):
         days = np.flatnonzero((counts.weekday >= 5) == weekend)
         y = counts.seen[:, days]
-        known = np.isfinite(y)
-        total, n = np.nan_to_num(y).cumsum(axis=1), known.cumsum(axis=1)
-        before = np.where(n > 0, total / np.maximum(n, 1), np.nan)
-        result[:, days[1:]] = before[:, :-1]
+        total, n = np.nan_to_num(y).cumsum(axis=1), np.isfinite(y).cumsum(axis=1)
+        result[:, days[1:]] = np.where(n > 0, total / np.maximum(n, 1), np.nan)[:, :-1]
     return result
 
 
@@ -59,7 +56,6 @@ def last_week(counts: Counts) -> FloatArray:
 
 
 def last_four_weekdays(counts: Counts) -> FloatArray:
-    """Return the mean of the hour on the last four same weekdays, (c, d, 24)."""
     return _mean([_days_ago(counts.seen, _WEEK * k) for k in (1, 2, 3, 4)])
 
 
@@ -102,7 +98,8 @@ def gradient_boosting(counts: Counts, first: int) -> FloatArray:
     features = features if c <= _MAX_CATEGORIES else features[..., 1:]
     result = np.full(y.shape, np.nan)
     rng = np.random.default_rng(0)
-    for start in _fits(counts, first):
+    # Once before the first day, so that the trees have errors of their own.
+    for start in range(max(first - _REFIT_DAYS, first % _REFIT_DAYS), len(counts.days), _REFIT_DAYS):
         rows = np.argwhere(np.isfinite(y[:, :start]))
         if len(rows) > _MAX_ROWS:
             rows = rows[rng.choice(len(rows), _MAX_ROWS, replace=False)]
@@ -119,11 +116,6 @@ def gradient_boosting(counts: Counts, first: int) -> FloatArray:
             inputs = features[:, days][..., used]
             result[:, days] = model.predict(inputs.reshape(-1, inputs.shape[-1])).reshape(inputs.shape[:3])
     return result
-
-
-def _fits(counts: Counts, first: int) -> range:
-    """Return the days at which the trees are fitted; once before the first, so that they have errors of their own."""
-    return range(max(first - _REFIT_DAYS, first % _REFIT_DAYS), len(counts.days), _REFIT_DAYS)
 
 
 def with_past_errors(points: FloatArray, counts: Counts, first: int) -> DayForecast:
@@ -171,15 +163,10 @@ def compare(
 
     `on_day` is called with the number of days that our model, with `settings`, has done.
     """
-    points: dict[str, Callable[[Counts], FloatArray]] = {
-        "last-four-weekdays": last_four_weekdays,
-        "last-week": last_week,
-        "hour-mean": hour_mean,
-        "gradient-boosting": lambda counts: gradient_boosting(counts, first),
-    }
-    for model in MODELS:
-        if model == OURS:
+    points = (last_four_weekdays, last_week, hour_mean, lambda counts: gradient_boosting(counts, first))
+    for model, points_of in zip(MODELS, (None, *points), strict=True):
+        if points_of is None:
             forecast = forecast_days(counts, first, "rolling", settings, on_day)
         else:
-            forecast = with_past_errors(points[model](counts), counts, first)
+            forecast = with_past_errors(points_of(counts), counts, first)
         yield Compared(model, forecast, Scores.of(forecast, counts))

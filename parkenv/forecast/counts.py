@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -55,25 +56,17 @@ _REPEATS_PRIOR = (2.0, 4.0)  # repeats of readings, and pairs, assumed before an
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Occupancy of car parks by local hour; arrays over (car park, day, hour of the day).
+    """Occupancy of car parks by local hour; arrays over (car park, day, hour of the day)."""
 
-    Args:
-        car_parks: (c,) names.
-        days: (d,) dates without a gap, ascending.
-        capacity: (c, d) float64, places; that of the day before where a day states none.
-        occupied: (c, d, 24) float64, fraction of the places that is taken; NaN without a usable reading.
-        seen: (c, d, 24) float64, the same as known at the end of that day, for models that learn day by day.
-        faults: (c,) number of readings, or days, by rule.
-        source: name of the file in messages.
-    """
-
-    car_parks: tuple[str, ...]
-    days: tuple[date, ...]
-    capacity: FloatArray
+    car_parks: tuple[str, ...]  # (c,) names
+    days: tuple[date, ...]  # (d,) dates without a gap, ascending
+    capacity: FloatArray  # (c, d) float64, places; that of the day before where a day states none
+    # (c, d, 24) float64, fraction of the places that is taken; NaN without a usable reading
     occupied: FloatArray
+    # (c, d, 24) float64, the same as known at the end of that day, for models that learn day by day
     seen: FloatArray
-    faults: tuple[dict[str, int], ...]
-    source: str = "counts"
+    faults: tuple[dict[str, int], ...]  # (c,) number of readings, or days, by rule
+    source: str = "counts"  # name of the file in messages
 
     @classmethod
     def read(cls, path: str | Path, timezone: str = "Europe/Berlin") -> Counts:
@@ -82,13 +75,14 @@ class Counts:
         `timezone`, an IANA name, is the local time of `hour_utc` and `time_utc`, and of when summer time begins and
         ends.
         """
-        zone = _time_zone(timezone)
-        readings = _read(path, zone)
-        return _cleaned(readings, zone, str(path))
+        try:
+            zone = ZoneInfo(timezone)
+        except (KeyError, ValueError, OSError) as error:
+            raise InputError(f"timezone is {timezone!r}, want an IANA name such as Europe/Berlin") from error
+        return _cleaned(_read(path, zone), zone, str(path))
 
     @cached_property
     def weekday(self) -> NDArray[np.int64]:
-        """(d,) weekday of each day, Monday = 0."""
         return np.array([day.weekday() for day in self.days])
 
     def day_index(self, day: date) -> int:
@@ -96,34 +90,30 @@ class Counts:
         return min(max((day - self.days[0]).days, 0), len(self.days))
 
     def total_faults(self) -> dict[str, int]:
-        """Return the number of readings, or days, by rule, over all car parks."""
         return {name: sum(faults[name] for faults in self.faults) for name in self.faults[0]}
 
     def idle(self, most: float = 0.02) -> dict[str, str]:
-        """Return what is odd about car parks that show no use: by name, without readings, dead, or never filling."""
-        found = {}
+        idle = {}
         for name, y in zip(self.car_parks, self.occupied, strict=True):
             y = y[np.isfinite(y)]
             if not y.size:
-                found[name] = "no usable readings"
+                idle[name] = "no usable readings"
             elif np.quantile(y, 0.98) - np.quantile(y, 0.02) < most:
-                found[name] = f"dead: always {np.median(y):.0%} full"
+                idle[name] = f"dead: always {np.median(y):.0%} full"
             elif np.quantile(y, 0.999) < 0.25:
-                found[name] = f"never filling: at most {y.max():.0%} full"
-        return found
+                idle[name] = f"never filling: at most {y.max():.0%} full"
+        return idle
 
     def chosen(self, names: Iterable[str]) -> Counts:
-        rows = []
+        names = list(names)
         for name in names:
             if name not in self.car_parks:
                 raise InputError(f"{self.source}: has no car park {name!r}; {nearest(name, self.car_parks)}")
-            rows.append(self.car_parks.index(name))
-        return self.part(rows)
+        return self.part([self.car_parks.index(name) for name in names])
 
     def part(
         self, rows: Sequence[int] | NDArray[np.int64], first: int = 0, last: int | None = None
     ) -> Counts:
-        """Return the counts of car parks by index, and of the days with index `first` to `last` - 1."""
         days = slice(first, last)
         names, faults = zip(*((self.car_parks[i], self.faults[i]) for i in rows), strict=True)
         capacity, occupied, seen = (array[rows, days] for array in (self.capacity, self.occupied, self.seen))
@@ -131,13 +121,11 @@ class Counts:
 
 
 def is_counts(path: str | Path) -> bool:
-    """Return whether a file has the columns of counts, and not those of a log of slots."""
     _, header = next(csv_rows(path, MAX_COUNT_BYTES), (0, []))
     return {"car_park", "free"} <= set(header)
 
 
-@dataclass(frozen=True)
-class _Readings:
+class _Readings(NamedTuple):
     car_parks: tuple[str, ...]
     first: date
     n_days: int
@@ -146,13 +134,6 @@ class _Readings:
     hour: NDArray[np.int64]
     capacity: FloatArray
     free: FloatArray
-
-
-def _time_zone(name: str) -> ZoneInfo:
-    try:
-        return ZoneInfo(name)
-    except (KeyError, ValueError, OSError) as error:
-        raise InputError(f"timezone is {name!r}, want an IANA name such as Europe/Berlin") from error
 
 
 def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
@@ -228,7 +209,8 @@ def _cleaned(readings: _Readings, zone: ZoneInfo, source: str) -> Counts:
         lost = (free < -_TOLERANCE * whole) | (free > (1 + _TOLERANCE) * whole)
     occupied = 1.0 - np.where(lost, np.nan, np.clip(free, 0.0, whole)) / whole
     recognised, stuck = _stuck(occupied, np.array([day.weekday() >= 5 for day in days]))
-    spans = [_span(np.isfinite(y).any(axis=1)) for y in occupied]
+    present = [np.flatnonzero(np.isfinite(y).any(axis=1)) for y in occupied]
+    spans = [slice(where[0], where[-1] + 1) if where.size else slice(0) for where in present]
     faults = tuple(
         {
             "negative": int(negative[i].sum()),
@@ -246,26 +228,24 @@ def _cleaned(readings: _Readings, zone: ZoneInfo, source: str) -> Counts:
     return Counts(readings.car_parks, days, capacity, usable, seen, faults, source)
 
 
-def _span(present: BoolArray) -> slice:
-    where = np.flatnonzero(present)
-    return slice(where[0], where[-1] + 1) if where.size else slice(0)
-
-
 def _summer_time(days: tuple[date, ...], zone: ZoneInfo) -> dict[int, int]:
     """Return the days of 23 or 25 hours, by index, with the hour that comes twice, -1 if none does."""
     midnights = [datetime(day.year, day.month, day.day, tzinfo=zone) for day in days]
-    found = {}
+    changes = {}
     for i, start in enumerate(midnights):
         hours = [start.replace(hour=hour) for hour in range(HOURS)]
         if hours[0].utcoffset() != hours[-1].utcoffset():
             # The hour that the spring leaves out differs by fold as well, but is changed on the way through UTC.
-            twice = (t.hour for t in hours if t.utcoffset() != t.replace(fold=1).utcoffset() and _exists(t))
-            found[i] = next(twice, -1)
-    return found
-
-
-def _exists(local: datetime) -> bool:
-    return local.astimezone(UTC).astimezone(local.tzinfo).hour == local.hour
+            changes[i] = next(
+                (
+                    t.hour
+                    for t in hours
+                    if t.utcoffset() != t.replace(fold=1).utcoffset()
+                    and t.astimezone(UTC).astimezone(zone).hour == t.hour
+                ),
+                -1,
+            )
+    return changes
 
 
 def _by_hour(
@@ -290,7 +270,6 @@ def _by_hour(
 
 
 def _carried_forward(values: FloatArray) -> FloatArray:
-    """Replace NaN in rows by the last value before it, in front of the first by the first; all NaN by 1."""
     index = np.where(np.isfinite(values), np.arange(values.shape[1]), 0)
     filled = np.take_along_axis(values, np.maximum.accumulate(index, axis=1), axis=1)
     first = np.take_along_axis(values, np.isfinite(values).argmax(axis=1)[:, None], axis=1)
@@ -319,7 +298,6 @@ def _capacity_in_force(stated: FloatArray, free: FloatArray) -> FloatArray:
 
 
 def _stuck(occupied: FloatArray, weekend: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Return which readings (c, d, 24) are known to be stuck when they arrive, and which belong to such a run."""
     c, d, _ = occupied.shape
     recognised = np.zeros(occupied.shape, bool)
     stuck = recognised.copy()

@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable, Hashable
 from dataclasses import asdict, dataclass, replace
 from datetime import date
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,31 +65,18 @@ _FIT_WARM_UP = 45
 
 @dataclass(frozen=True)
 class CurveSettings:
-    """Variances of the model, log-odds squared; those of a block are those of its mean level.
+    """Variances of the model, log-odds squared; those of a block are those of its mean level."""
 
-    Args:
-        level_drift: of the common level, per day.
-        common_drift: of the first harmonics of the common curve, per day.
-        class_drift: of Saturdays and Sundays, per day.
-        class_spread: of Saturdays and Sundays before any is seen.
-        weekday_drift: of each other weekday, per day.
-        weekday_spread: of each other weekday before any is seen.
-        day_memory: correlation of a day's own deviation with that of the day before, in (0, 1).
-        day_spread: of the shape of a day's own deviation.
-        day_level_spread: of its mean level.
-        noise: of a single hour.
-    """
-
-    level_drift: float = 0.017
-    common_drift: float = 4e-4
-    class_drift: float = 3e-4
-    class_spread: float = 0.08
-    weekday_drift: float = 1e-5
-    weekday_spread: float = 0.02
-    day_memory: float = 0.55
-    day_spread: float = 0.036
-    day_level_spread: float = 0.28
-    noise: float = 0.02
+    level_drift: float = 0.017  # of the common level, per day
+    common_drift: float = 4e-4  # of the first harmonics of the common curve, per day
+    class_drift: float = 3e-4  # of Saturdays and Sundays, per day
+    class_spread: float = 0.08  # of Saturdays and Sundays before any is seen
+    weekday_drift: float = 1e-5  # of each other weekday, per day
+    weekday_spread: float = 0.02  # of each other weekday before any is seen
+    day_memory: float = 0.55  # correlation of a day's own deviation with that of the day before, in (0, 1)
+    day_spread: float = 0.036  # of the shape of a day's own deviation
+    day_level_spread: float = 0.28  # of its mean level
+    noise: float = 0.02  # of a single hour
 
 
 class _Filter:
@@ -127,7 +114,6 @@ class _Filter:
         return _Curve(mean, np.asarray(sum(across[:, part] for part in parts)), across)
 
     def update(self, curve: _Curve, fit: _Fit, discount: FloatArray) -> None:
-        """Take in an observed day; its information is divided by `discount` (c,)."""
         self.mean += (curve.across @ (fit.step / discount[:, None])[:, :, None])[:, :, 0]
         self.covariance -= (curve.across @ (fit.gain / discount[:, None, None])) @ np.swapaxes(
             curve.across, 1, 2
@@ -136,23 +122,15 @@ class _Filter:
         self.covariance *= 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class _Curve:
+_Parts = TypeVar("_Parts", "_Curve", "_Fit")
+
+
+class _Curve(NamedTuple):
     """Coefficients of the curve of a day: mean (c, k), covariance (c, k, k), and with the state, (c, n, k)."""
 
     mean: FloatArray
     covariance: FloatArray
     across: FloatArray
-
-    def where(self, mask: BoolArray, other: _Curve) -> _Curve:
-        if not mask.any():
-            return other
-        m = mask[:, None, None]
-        return _Curve(
-            np.where(mask[:, None], self.mean, other.mean),
-            np.where(m, self.covariance, other.covariance),
-            np.where(m, self.across, other.across),
-        )
 
     def fit(self, z: FloatArray, weight: FloatArray) -> _Fit:
         """Compare the curve with log-odds (c, 24), observed with inverse noise variances `weight`, 0 if unobserved."""
@@ -168,24 +146,13 @@ class _Curve:
         return _Fit(step, gain, distance, np.linalg.slogdet(ratio)[1])
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
+class _Fit(NamedTuple):
     """How a day fits a curve: step (c, k), gain (c, k, k); squared distance and log-determinant (c,)."""
 
     step: FloatArray
     gain: FloatArray
     distance: FloatArray
     log_det: FloatArray
-
-    def where(self, mask: BoolArray, other: _Fit) -> _Fit:
-        if not mask.any():
-            return other
-        return _Fit(
-            np.where(mask[:, None], self.step, other.step),
-            np.where(mask[:, None, None], self.gain, other.gain),
-            np.where(mask, self.distance, other.distance),
-            np.where(mask, self.log_det, other.log_det),
-        )
 
     def log_likelihood(self, n: NDArray[np.int64]) -> FloatArray:
         """Return the log-likelihood (c,) of n observed hours, multivariate t, up to what all curves share."""
@@ -194,6 +161,13 @@ class _Fit:
             - self.log_det / 2
             - (FREEDOM + n) / 2 * np.log1p(self.distance / (FREEDOM - 2))
         )
+
+
+def _where(mask: BoolArray, chosen: _Parts, other: _Parts) -> _Parts:
+    if not mask.any():
+        return other
+    pairs = zip(chosen, other, strict=True)
+    return type(other)(*(np.where(mask.reshape(-1, *(1,) * (b.ndim - 1)), a, b) for a, b in pairs))
 
 
 def key_of(day: date) -> Hashable:
@@ -221,8 +195,6 @@ def _easter(year: int) -> date:
 
 
 class SpecialDays:
-    """What earlier years say of the dates of the year, for n car parks."""
-
     def __init__(self, n: int) -> None:
         self._n = n
         self._known: dict[Hashable, tuple[NDArray[np.float64], float]] = {}
@@ -274,7 +246,7 @@ def filter_days(
         own = curve = state.curve(weekday)
         sunday = state.curve(_SUNDAY) if weekday != _SUNDAY and day >= _SETTLED else None
         if sunday is not None:
-            curve = sunday.where(special.expected(counts.days[day]), own)
+            curve = _where(special.expected(counts.days[day]), sunday, own)
         if day >= first:
             middle = curve.mean @ _BASIS.T
             p = expit(middle)
@@ -297,7 +269,7 @@ def filter_days(
                 other = sunday.fit(z, weight)
                 evidence = other.log_likelihood(hours) - fit.log_likelihood(hours)
                 mask = special.observe(counts.days[day], evidence, hours >= _MIN_HOURS_SPECIAL)
-                curve, fit = sunday.where(mask, own), other.where(mask, fit)
+                curve, fit = _where(mask, sunday, own), _where(mask, other, fit)
             error = fit.distance / np.maximum(hours, 1)
             memory = np.where(learned, np.minimum(memory + 1.0, _MEMORY), memory)
             step = (np.minimum(error, _MEMORY * scale) - scale) / memory

@@ -39,7 +39,6 @@ _FIRST_STEP = 0.3  # of a car park; the steps fall to the above as its days pass
 
 
 def logits(occupied: FloatArray, capacity: FloatArray) -> FloatArray:
-    """Return the log-odds of occupied fractions, which half a place keeps finite; NaN becomes 0."""
     taken = np.nan_to_num(occupied) * capacity
     return np.asarray(np.log((taken + 0.5) / (np.maximum(capacity - taken, 0.0) + 0.5)))
 
@@ -53,7 +52,6 @@ def quantiles_of_t(n: int = 32) -> FloatArray:
 
 @cache
 def _draws() -> FloatArray:
-    """Return equally likely draws (k, 24) of uncorrelated t variables of variance 1 (a scrambled Sobol sequence)."""
     points = qmc.Sobol(HOURS + 1, rng=0).random(_N_DRAWS // 2)
     normal = ndtri(np.clip(points[:, :HOURS], 1e-6, 1 - 1e-6))
     scale = np.sqrt((FREEDOM - 2.0) / chi2.ppf(np.clip(points[:, HOURS:], 1e-6, 1 - 1e-6), FREEDOM))
@@ -69,23 +67,16 @@ def draw_days(mean: FloatArray, covariance: NDArray[Any]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class DayForecast:
-    """Forecasts of several days of several car parks, each made before its day.
+    """Forecasts of several days of several car parks, each made before its day."""
 
-    Args:
-        first: index of the first of the d days among those of the counts.
-        mean: (c, d, 24) float64, log-odds of the occupancy.
-        covariance: (c, d, 24, 24) float32, of the log-odds, over the hours of a day.
-        point: (c, d, 24), the expected occupied fraction, where a model states one of its own.
-    """
-
-    first: int
-    mean: FloatArray
-    covariance: NDArray[np.float32]
+    first: int  # index of the first of the d days among those of the counts
+    mean: FloatArray  # (c, d, 24) float64, log-odds of the occupancy
+    covariance: NDArray[np.float32]  # (c, d, 24, 24) float32, of the log-odds, over the hours of a day
+    # (c, d, 24), the expected occupied fraction, where a model states one of its own
     point: FloatArray | None = None
 
     @property
     def sd(self) -> FloatArray:
-        """(c, d, 24) standard deviation of each hour, log-odds."""
         return np.asarray(np.sqrt(self.covariance[:, :, DIAGONAL, DIAGONAL].astype(float)))
 
     @property
@@ -118,21 +109,17 @@ class DayForecast:
         observed = np.isfinite(seen)
         z = logits(seen, counts.capacity[:, days, None])
         v = self.covariance.astype(float)
-        both = observed[..., :, None] & observed[..., None, :]
-        within = np.where(both, v, 0.0)
+        within = np.where(observed[..., :, None] & observed[..., None, :], v, 0.0)
         within[..., DIAGONAL, DIAGONAL] += np.where(observed, 1e-9, 1.0)
         across = np.where(observed[..., None, :], v, 0.0)
         gain = np.swapaxes(np.linalg.solve(within, np.swapaxes(across, -1, -2)), -1, -2)
-        error = np.where(observed, z - self.mean, 0.0)
-        mean = self.mean + (gain @ error[..., None])[..., 0]
+        mean = self.mean + (gain @ np.where(observed, z - self.mean, 0.0)[..., None])[..., 0]
         rest = v - gain @ np.swapaxes(across, -1, -2)
         rest[..., DIAGONAL, DIAGONAL] = np.maximum(rest[..., DIAGONAL, DIAGONAL], 0.0)
         return replace(self, mean=mean, covariance=rest.astype(np.float32), point=None)
 
 
 class _Scale:
-    """Logarithms of scales, per car park and band of fullness."""
-
     def __init__(self, n: int) -> None:
         self._car_park, self._band = np.zeros(n), np.zeros(len(_BANDS) + 1)
         self._days = np.zeros(n)
@@ -156,7 +143,6 @@ def day_means(fractions: FloatArray, observed: BoolArray) -> FloatArray:
 
 
 def holds(occupied: FloatArray, low: FloatArray, high: FloatArray, capacity: FloatArray) -> BoolArray:
-    """Return whether intervals hold what was observed, up to the half place by which counts are rounded."""
     half = 0.5 / capacity
     return np.asarray((occupied >= low - half) & (occupied <= high + half))
 
@@ -180,8 +166,7 @@ def calibrated(forecast: DayForecast, counts: Counts, until: int | None = None) 
             y, o, places = occupied[rows], observed[rows], counts.capacity[rows, day]
             days = draw_days(mean[rows], spread[rows])
             low, high = np.quantile(day_means(days, o), INTERVAL, axis=1)
-            covered = holds(day_means(y, o), low, high, places)
-            levels.update(rows, band[rows], (~covered).astype(float))
+            levels.update(rows, band[rows], (~holds(day_means(y, o), low, high, places)).astype(float))
             low, high = np.quantile(days, INTERVAL, axis=1)
             missed = ~holds(y, low, high, places[:, None]) & o
             hours.update(rows, band[rows], missed.sum(axis=1) / o.sum(axis=1))

@@ -11,14 +11,11 @@ from parkenv.compiled.arrays import FloatArray
 
 
 class NormalQuadrature(NamedTuple):
-    """Quadrature for a standard normal variable."""
-
     nodes: FloatArray
     weights: FloatArray
 
     @classmethod
     def gauss_hermite(cls, n: int) -> Self:
-        """Return the rule of n nodes that is exact for polynomials."""
         nodes, weights = np.polynomial.hermite_e.hermegauss(n)
         return cls(nodes, weights / weights.sum())
 

@@ -17,13 +17,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.special import expit
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import require_number
+from parkenv.files.field_types import NotNegative, NumberOrInf, Positive, Validated
 from parkenv.forecast.logistic_normal import EVEN
 
 HOURS = 24
@@ -38,33 +40,18 @@ UPDATES = 32  # of a covariance at once
 
 
 @dataclass(frozen=True)
-class MapErrorPrior:
-    """How wrong a map may be, before any trip: standard deviations, in logits.
+class MapErrorPrior(Validated):
+    """How wrong a map may be, before any trip: standard deviations, in logits."""
 
-    Args:
-        level: of the error that all slots share.
-        slope: of the rise of the error from the middle of the lot to the goal.
-        smooth: of the part that is smooth in nearness.
-        own: of each slot's own part.
-        hour: of the part that depends on the hour of the day.
-        memory_days: time constant of the drift, in days: after this time, 1/e of the error is left.
-        weight: probability of this prior, relative to the others.
-        trust: factor of the map's logits; 0 if the map says nothing.
-    """
-
-    level: float
-    slope: float
-    smooth: float
-    own: float
-    hour: float
-    memory_days: float
-    weight: float = 1.0
-    trust: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            bound = "above" if name in ("memory_days", "weight") else "least"
-            require_number(f"MapErrorPrior.{name}", value, finite=False, **{bound: 0.0})
+    level: NotNegative  # of the error that all slots share
+    slope: NotNegative  # of the rise of the error from the middle of the lot to the goal
+    smooth: NotNegative  # of the part that is smooth in nearness
+    own: NotNegative  # of each slot's own part
+    hour: NotNegative  # of the part that depends on the hour of the day
+    # time constant of the drift, in days: after this time, 1/e of the error is left
+    memory_days: Annotated[NumberOrInf, Field(gt=0.0)]
+    weight: Positive = 1.0  # probability of this prior, relative to the others
+    trust: NotNegative = 1.0  # factor of the map's logits; 0 if the map says nothing
 
     def covariance(self, nearness: FloatArray) -> FloatArray:
         """Covariance of f and g, (n + 48, n + 48), for slots of the given nearness, (n,), -1 to 1."""
@@ -88,18 +75,13 @@ class MapErrorPrior:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the observations of one day say about k states of slots, each taken or free.
+    """What the observations of one day say about k states of slots, each taken or free."""
 
-    Attributes:
-        slots: (k,) int64.
-        hours: (k,) float64, hours since Monday 00:00, when each state was observed.
-        likelihood: (k, 2) float64, probability of its observations if the slot was free, and if it was taken.
-        weight: (k,) float64, by how much each counts, 0 to 1; below 1 if an earlier one already says a part of it.
-    """
-
-    slots: NDArray[np.int64]
-    hours: FloatArray
+    slots: NDArray[np.int64]  # (k,) int64
+    hours: FloatArray  # (k,) float64, hours since Monday 00:00, when each state was observed
+    # (k, 2) float64, probability of its observations if the slot was free, and if it was taken
     likelihood: FloatArray
+    # (k,) float64, by how much each counts, 0 to 1; below 1 if an earlier one already says a part of it
     weight: FloatArray
 
 
@@ -140,13 +122,11 @@ class MapError:
         return np.asarray(np.exp(self._log_weights))
 
     def prior_sd(self) -> FloatArray:
-        """Standard deviation of each slot's error before any trip, (k, n), logits."""
         n = len(self._nearness)
         variance = np.diagonal(self._priors, axis1=1, axis2=2)
         return np.asarray(np.sqrt(variance[:, :n] + variance[:, n, None]))
 
     def pass_days(self, days: float) -> None:
-        """Forget: let the error drift for a time."""
         kept = np.exp(-days / self._memory_days)
         self._mean *= kept[:, None]
         gone = kept[:, None, None] ** 2
@@ -177,7 +157,11 @@ class MapError:
         self._covariance -= half.transpose(0, 2, 1) @ half
         weights = self._log_weights + log_evidence
         weights -= weights.max()
-        self._keep(np.exp(weights) >= NEGLIGIBLE * np.exp(weights).sum(), weights)
+        kept = np.exp(weights) >= NEGLIGIBLE * np.exp(weights).sum()
+        self._log_weights = weights[kept] - np.log(np.exp(weights[kept]).sum())
+        if not kept.all():
+            for name in ("_priors", "_memory_days", "trust", "_mean", "_covariance"):
+                setattr(self, name, getattr(self, name)[kept])
 
     def predict(self, hour: float) -> tuple[FloatArray, FloatArray]:
         """Return mean and variance of each slot's error, (n_priors, n) each, at hours since Monday 00:00."""
@@ -198,13 +182,6 @@ class MapError:
         slope[:n] = self._nearness / max(float(self._nearness @ self._nearness), 1e-12)
         both = [np.sqrt(np.einsum("kd,d->k", self._covariance @ a, a)) for a in (level, slope)]
         return both[0], both[1]
-
-    def _keep(self, kept: NDArray[np.bool_], log_weights: FloatArray) -> None:
-        rest = log_weights[kept]
-        self._log_weights = rest - np.log(np.exp(rest).sum())
-        if not kept.all():
-            for name in ("_priors", "_memory_days", "trust", "_mean", "_covariance"):
-                setattr(self, name, getattr(self, name)[kept])
 
     def _knots(self, hours: FloatArray) -> list[tuple[NDArray[np.int64], FloatArray]]:
         """Return the two parts of g between which each of the hours, (k,), lies, and their shares, (k,) each."""
@@ -260,8 +237,7 @@ def _approximate(
             new_variance = (density * (points - new_mean[:, None]) ** 2).sum(axis=1) / total
             # Errors of a sensor could widen the distribution; an observation never makes the map less certain.
             narrower = np.clip(new_variance, 1e-9, without * (1.0 - 1e-9))
-            added = 1.0 / narrower - 1.0 / without
-            change = added - precision[:, i]
+            change = (1.0 / narrower - 1.0 / without) - precision[:, i]
             shift = new_mean / narrower - center / without - location[:, i]
             scale = 1.0 + change * variance
             mean += column * ((shift - change * mean[:, i]) / scale)[:, None]

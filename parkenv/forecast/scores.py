@@ -61,29 +61,20 @@ class Scores:
     """Scores of one model's forecasts of d days with t hours or other periods; NaN where nothing was observed.
 
     Either of r whole car parks, each of them in a row of its own, or of the r slots of one car park.
-
-    Args:
-        log_loss, brier: (r, d, t) of a place that is taken or not.
-        crps: (c, d, t) of the occupied fraction of each of c car parks.
-        occupancy: (r, d, t) forecast.
-        observed: (r, d, t) occupied fraction.
-        weight: (r, d, t) of each of these, 0 where nothing was observed.
-        day_covered: (c, d) float64, 1 where the 90 % interval of the day's mean covers the observed one.
-        day_forecast, day_observed: (c, d) mean over the day's observed periods.
-        block: number of days whose errors the interval of a difference takes for dependent.
-        hour_covered: (c, d, t) float64, 1 where the 90 % interval of a period covers the observed fraction.
     """
 
-    log_loss: FloatArray
+    log_loss: FloatArray  # (r, d, t) of a place that is taken or not
     brier: FloatArray
-    crps: FloatArray
-    occupancy: FloatArray
-    observed: FloatArray
-    weight: FloatArray
+    crps: FloatArray  # (c, d, t) of the occupied fraction of each of c car parks
+    occupancy: FloatArray  # (r, d, t) forecast
+    observed: FloatArray  # (r, d, t) occupied fraction
+    weight: FloatArray  # (r, d, t) of each of these, 0 where nothing was observed
+    # (c, d) float64, 1 where the 90 % interval of the day's mean covers the observed one
     day_covered: FloatArray
-    day_forecast: FloatArray
+    day_forecast: FloatArray  # (c, d) mean over the day's observed periods
     day_observed: FloatArray
-    block: int
+    block: int  # number of days whose errors the interval of a difference takes for dependent
+    # (c, d, t) float64, 1 where the 90 % interval of a period covers the observed fraction
     hour_covered: FloatArray | None = None
 
     @classmethod
@@ -128,17 +119,31 @@ class Scores:
     def coverage_by_band(self, *, observed: bool = False) -> list[Band]:
         """Return how many days each band of fullness has, and how many of them the 90 % intervals hold.
 
-        Args:
-            observed: whether the day's observed fullness gives the band. Days of unexpected fullness are missed then by
-                construction; the forecast fullness does not know the day.
+        The fullness is the forecast one or, with `observed`, that of the day itself: days of unexpected fullness are
+        missed then by construction.
         """
-        return coverage_by_band(self.day_observed if observed else self.day_forecast, self.day_covered)
+        fullness, covered = self.day_observed if observed else self.day_forecast, self.day_covered
+        rows: list[Band] = []
+        for low, high in pairwise(BANDS):
+            inside = (fullness >= low) & ((fullness < high) | (high == BANDS[-1])) & np.isfinite(covered)
+            share = float(covered[inside].mean()) if inside.any() else None
+            rows.append({"from": low, "to": high, "days": int(inside.sum()), "coverage_90": share})
+        return rows
 
-    def reliability(self) -> FloatArray:
-        return reliability(self.occupancy, self.observed, self.weight)
+    def reliability(self, bins: int = 20) -> FloatArray:
+        """Return mean forecast, mean of what was observed, and weight (3, k) of equally wide bins of the forecast.
+
+        Empty bins are left out.
+        """
+        seen = self.weight > 0
+        p, weight = self.occupancy[seen], self.weight[seen]
+        cell = np.minimum((p * bins).astype(int), bins - 1)
+        n = np.bincount(cell, weight, bins)
+        used = n > 0
+        sums = (np.bincount(cell, weight * values, bins) for values in (p, self.observed[seen]))
+        return np.stack([*(total[used] / n[used] for total in sums), n[used]])
 
     def means(self) -> dict[str, float]:
-        """Return each score in the mean, and the numbers of days and car parks with readings."""
         observed = np.isfinite(self.crps)
         seen = self.weight > 0
         log_loss, brier = (
@@ -169,38 +174,6 @@ class Scores:
         return ratio_of_sums(total, n, rng)
 
 
-def coverage_by_band(fullness: FloatArray, covered: FloatArray) -> list[Band]:
-    """Return the number of days in each band of fullness, and the share of them in their intervals.
-
-    `covered` is 1 where the day's interval holds what was observed, NaN where nothing was.
-    """
-    rows: list[Band] = []
-    for low, high in pairwise(BANDS):
-        inside = covered[(fullness >= low) & ((fullness < high) | (high == BANDS[-1])) & np.isfinite(covered)]
-        rows.append(
-            {
-                "from": low,
-                "to": high,
-                "days": inside.size,
-                "coverage_90": float(inside.mean()) if inside.size else None,
-            }
-        )
-    return rows
-
-
-def reliability(p: FloatArray, observed: FloatArray, weight: FloatArray, bins: int = 20) -> FloatArray:
-    """Return mean forecast, mean of what was observed, and weight (3, k) of equally wide bins of the forecast.
-
-    `weight` is 0 where nothing was observed. Empty bins are left out.
-    """
-    seen = weight > 0
-    cell = np.minimum((p[seen] * bins).astype(int), bins - 1)
-    n = np.bincount(cell, weight[seen], bins)
-    used = n > 0
-    sums = (np.bincount(cell, weight[seen] * values[seen], bins) for values in (p, observed))
-    return np.stack([*(total[used] / n[used] for total in sums), n[used]])
-
-
 class Estimate(NamedTuple):
     value: float
     low: float
@@ -229,6 +202,5 @@ def ratio_of_sums(
 
 
 def mean_where(values: FloatArray, mask: BoolArray | None = None) -> float:
-    """Return the mean of what is not NaN; NaN if there is nothing."""
     chosen = values[np.isfinite(values) if mask is None else np.isfinite(values) & mask]
     return float(chosen.mean()) if chosen.size else float("nan")

@@ -17,10 +17,8 @@ from parkenv.forecast.slot_days import Days, SlotDays, fit_slot_days
 OURS = "slot-days"
 _DRAWS = 400
 _EDGE = 0.001  # forecasts stay this far from 0 and 1
-_LEVEL_SD, _LEVEL_DAYS = (
-    0.77,
-    2.0,
-)  # logits, of a day's error of a baseline before it has made any; its weight
+# logits, of a day's error of a baseline before it has made any; its weight
+_LEVEL_SD, _LEVEL_DAYS = 0.77, 2.0
 _SMOOTH = 1.5  # periods, of the features of gradient boosting
 
 
@@ -35,14 +33,11 @@ class ScoredDay(NamedTuple):
     draws: FloatArray
 
     def lot_means(self, values: FloatArray) -> FloatArray:
-        """Return the means of values, (m, t), over the observed slots, (u,)."""
         used = self.seen.sum(axis=0) > 0
         return np.asarray((values * self.seen)[:, used].sum(axis=0) / self.seen[:, used].sum(axis=0))
 
 
 class ComparedSlots(NamedTuple):
-    """A model's forecasts of slots, in order of time, and their scores."""
-
     model: str
     days: tuple[ScoredDay, ...]
     scores: Scores
@@ -82,9 +77,9 @@ def compare_slot_days(
                 if counts:
                     scored[name].append(_scored(p, np.full((p.shape[1],) * 2, variance), day))
             if counts:
-                found = fit_slot_days(past).forecast(day.days)
-                p = np.clip(found.p_taken[0], _EDGE, 1 - _EDGE)
-                scored[OURS].append(_scored(p, found.curve_covariance[0], day))
+                forecast = fit_slot_days(past).forecast(day.days)
+                p = np.clip(forecast.p_taken[0], _EDGE, 1 - _EDGE)
+                scored[OURS].append(_scored(p, forecast.curve_covariance[0], day))
                 on_day()
     in_order = {name: sorted(days, key=lambda day: day.number) for name, days in scored.items()}
     return [ComparedSlots(name, tuple(days), _scores(days)) for name, days in in_order.items()]
@@ -144,7 +139,6 @@ def _level_error(p: FloatArray, taken: FloatArray, seen: FloatArray) -> float:
 
 
 def _scored(p: FloatArray, covariance: FloatArray, day: SlotDays) -> ScoredDay:
-    """Return a day with its forecast: P(taken), (m, t), and the covariance of the level's error, (t, t), logits²."""
     taken, seen = day.taken[:, 0], day.seen[:, 0]
     return ScoredDay(int(day.days.number[0]), p, taken, seen, _drawn_occupancy(p, covariance, seen))
 
@@ -176,7 +170,6 @@ def _scores(days: list[ScoredDay]) -> Scores:
 
 
 def _drawn_occupancy(p: FloatArray, covariance: FloatArray, seen: FloatArray) -> FloatArray:
-    """Draw days of the lot's mean occupancy, (k, u), in the periods with observations."""
     used = np.flatnonzero(seen.sum(axis=0) > 0)
     rng = np.random.default_rng(0)
     p, weight = p[:, used], seen[:, used] / seen[:, used].sum(axis=0)

@@ -110,16 +110,16 @@ class FittedSlotDays:
         """Forecast days that were not fitted; periods in which no day was observed get the nearest one's forecast."""
         first, last, n = self.periods
         curves = _Curves.of(self.periods, self.days, days)
-        found = curves.solve(self.hyperparameters, self.response, self.information)
+        solution, _ = curves.solve(self.hyperparameters, self.response, self.information)
         design = curves.design(days)
-        shared = np.linalg.inv(found.precision)
+        shared = np.linalg.inv(solution.precision)
         covariance = np.einsum("jta,ab,ktb->tjk", design, shared, design, optimize=True)
         each = np.arange(len(days.number))
         day = curves.day_covariance(self.hyperparameters)
         covariance[:, each, each] += np.diag(day)[:, None]
         curve = design @ shared @ design.transpose(0, 2, 1) + day
         parts = _parts(self.periods, _HABIT_PART)
-        mean = (design @ found.mean + self.correction)[:, None] + self.habits @ parts.T
+        mean = (design @ solution.mean + self.correction)[:, None] + self.habits @ parts.T
         variance = covariance[:, each, each].T[:, None] + _variance(parts, self.habit_covariance)
         at = np.clip(np.arange(n), first, last) - first
         p = _with_pseudo_days(_FINE.expit(mean, np.sqrt(variance))[0], len(self.days.number))
@@ -127,7 +127,6 @@ class FittedSlotDays:
 
 
 def fit_slot_days(data: SlotDays) -> FittedSlotDays:
-    """Fit the model to days of one class; at least one state was observed."""
     observed = np.flatnonzero(data.seen.sum(axis=(0, 1)))
     periods = int(observed[0]), int(observed[-1]), data.seen.shape[2]
     window = slice(periods[0], periods[1] + 1)
@@ -151,7 +150,7 @@ def fit_slot_days(data: SlotDays) -> FittedSlotDays:
             response = level + score / np.maximum(information, _JITTER)
             if step == (_LEVEL_STEPS if round_ == 0 else 0):
                 hyper = curves.tune(hyper, response, information)
-            change = curves.solve(hyper, response, information).level - level
+            change = curves.solve(hyper, response, information)[0].level - level
             level = np.clip(level + np.clip(change, -_MAX_STEP, _MAX_STEP), -_MAX_LEVEL, _MAX_LEVEL)
         precision = np.linalg.inv(pooled)
         for _ in range(_HABIT_STEPS):
@@ -175,8 +174,8 @@ def fit_slot_days(data: SlotDays) -> FittedSlotDays:
         dispersion = parts @ np.maximum((sums + weight * _DISPERSION) / (expected + weight), 1.0)
     # The mean over days of what is forecast is that of what was observed: Laplace's approximation shrinks the rare
     # state, and the variance of the level is that of all hours.
-    found = curves.solve(hyper, response, information)
-    mean = curves.design(data.days) @ found.mean + (habits @ parts.T)[:, None]
+    solution, _ = curves.solve(hyper, response, information)
+    mean = curves.design(data.days) @ solution.mean + (habits @ parts.T)[:, None]
     sd = np.sqrt(np.diag(curves.day_covariance(hyper)) + _variance(parts, covariance))[:, None]
     correction = np.zeros(len(parts))
     for _ in range(_CORRECTION_STEPS):
@@ -189,7 +188,6 @@ def fit_slot_days(data: SlotDays) -> FittedSlotDays:
 
 
 def _parts(periods: tuple[int, int, int], part: float) -> FloatArray:
-    """Return a basis of linear interpolation between knots `part` h apart, (t, k)."""
     first, last, n = periods
     knots = np.linspace(first, last, 1 + max(1, round((last - first) * _HOURS / n / part)))
     return np.stack([np.interp(np.arange(first, last + 1), knots, row) for row in np.eye(len(knots))], axis=1)
@@ -226,7 +224,6 @@ class _Curves:
 
     @cached_property
     def _profile(self) -> tuple[FloatArray, float]:
-        """Inverse and log-determinant of the covariance of the profile, which no hyperparameter changes."""
         lag = np.sqrt(3.0) * np.abs(self._lag) / _PROFILE_LENGTH
         covariance = _PROFILE_SD**2 + _PROFILE_CURVE_SD**2 * (1 + lag) * np.exp(-lag)
         covariance += _JITTER * np.eye(len(lag))
@@ -240,7 +237,6 @@ class _Curves:
         return cls(days, hours, _parts(periods, _WEEKDAY_PART), np.unique(numbers))
 
     def design(self, days: Days) -> FloatArray:
-        """Return what each coefficient adds to the log-odds, (d, t, n_coefficients)."""
         d, (t, k) = len(days.number), self.parts.shape
         weekdays = np.zeros((d, t, _WEEKDAYS, k))
         weekdays[np.arange(d), :, days.weekday] = self.parts
@@ -248,26 +244,20 @@ class _Curves:
         return np.concatenate([np.tile(np.eye(t), (d, 1, 1)), weekdays.reshape(d, t, -1), drift], axis=2)
 
     def day_covariance(self, hyper: FloatArray) -> FloatArray:
-        """Return the covariance of a day's level over its periods, (t, t)."""
         constant_sd, curve_sd, _ = np.exp(hyper[:3])
         return np.asarray(constant_sd**2 + curve_sd**2 * self._day_curve(hyper))
 
     def _day_curve(self, hyper: FloatArray) -> FloatArray:
-        """Return the correlation of a day's level, without its constant part, over its periods, (t, t)."""
         curve = np.exp(-0.5 * (self._lag / np.exp(hyper[2])) ** 2)
         return np.asarray(curve + _JITTER * np.eye(len(curve)))
 
-    def _drift_correlation(self, hyper: FloatArray) -> FloatArray:
-        return np.asarray(np.exp(-self._days_apart / np.exp(hyper[5])))
-
-    def solve(self, hyper: FloatArray, response: FloatArray, information: FloatArray) -> _Solution:
-        """Solve for the coefficients with the days' own levels integrated out (Henderson's equations)."""
-        return self._solve(hyper, response, information)[0]
-
-    def _solve(
+    def solve(
         self, hyper: FloatArray, response: FloatArray, information: FloatArray
     ) -> tuple[_Solution, FloatArray]:
-        """Return also the gradient of the evidence by the hyperparameters, (6,)."""
+        """Solve for the coefficients with the days' own levels integrated out (Henderson's equations).
+
+        Returns also the gradient of the evidence by the hyperparameters, (6,).
+        """
         t, (_, k), n = len(self.hours), self.parts.shape, len(self.numbers)
         day, root = self.day_covariance(hyper), np.sqrt(information)
         inner = np.eye(t) + root[:, :, None] * day * root[:, None]
@@ -278,7 +268,7 @@ class _Curves:
         precision = design.reshape(-1, size).T @ flat
         # Priors of the profile, of the weekdays and of the drift.
         weekday_sd, drift_sd, drift_days = np.exp(hyper[3:])
-        correlation = self._drift_correlation(hyper)
+        correlation = np.exp(-self._days_apart / drift_days)
         drift = drift_sd**2 * correlation + _JITTER * np.eye(n)
         inverse = np.zeros((size, size))
         inverse[:t, :t], log_prior = self._profile
@@ -323,20 +313,17 @@ class _Curves:
         return solution, gradient
 
     def tune(self, start: FloatArray, response: FloatArray, information: FloatArray) -> FloatArray:
-        """Return the hyperparameters of the largest marginal posterior."""
-
         def loss(hyper: FloatArray) -> tuple[float, FloatArray]:
             off = (hyper - _MEDIAN) / _SPREAD
-            solution, gradient = self._solve(hyper, response, information)
+            solution, gradient = self.solve(hyper, response, information)
             return 0.5 * float(off @ off) - solution.evidence, off / _SPREAD - gradient
 
         bounds = list(zip(_MEDIAN - 3 * _SPREAD, _MEDIAN + 3 * _SPREAD, strict=True))
-        found = minimize(
+        optimum = minimize(
             loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": _TUNING_STEPS}
         )
-        return np.asarray(found.x, float)
+        return np.asarray(optimum.x, float)
 
 
 def _with_pseudo_days(p_taken: FloatArray, n_days: int) -> FloatArray:
-    """Return the forecast from a number of days, and `_PSEUDO_DAYS` more."""
     return np.asarray((n_days * p_taken + 0.5 * _PSEUDO_DAYS) / (n_days + _PSEUDO_DAYS))

@@ -26,16 +26,13 @@ _ITERATIONS = 50
 
 @dataclass(frozen=True, eq=False)
 class TypicalWeekFit:
-    """The week of the typical car park, and how others differ from it.
+    """The week of the typical car park, and how others differ from it."""
 
-    Args:
-        occupied: (7, 24) float64, fraction that is taken at the end of each hour, in the car park of median level.
-        levels: (7,) float64, logits above that week, of the car parks fuller than `LEVEL_SHARES` of all.
-        day_errors: (c,) float64, logits, standard deviation over weekdays of a car park's level around its own week.
-    """
-
+    # (7, 24) float64, fraction that is taken at the end of each hour, in the car park of median level
     occupied: FloatArray
+    # (7,) float64, logits above that week, of the car parks fuller than `LEVEL_SHARES` of all
     levels: FloatArray
+    # (c,) float64, logits, standard deviation over weekdays of a car park's level around its own week
     day_errors: FloatArray
 
 
@@ -55,13 +52,12 @@ def fit_typical_week(counts: Counts) -> TypicalWeekFit | None:
             level = np.nanmedian((logits - week)[:, :6, BY_DAY].reshape(len(mean), -1), axis=1)
             level -= np.nanmedian(level)
             week = np.nanmedian(logits - level[:, None, None], axis=0)
-    errors = [_day_error(y, its, counts.weekday) for y, its in zip(counts.occupied, mean, strict=True)]
+    errors = [_day_error(y, week, counts.weekday) for y, week in zip(counts.occupied, mean, strict=True)]
     known = level[np.isfinite(level)]
     return TypicalWeekFit(expit(week), np.quantile(known, LEVEL_SHARES), np.array(errors))
 
 
 def _weeks(counts: Counts) -> FloatArray:
-    """Return the mean week of each car park, (c, 7, 24); NaN for hours with few readings."""
     weeks = np.full((len(counts.car_parks), 7, 24), np.nan)
     for day in range(7):
         readings = counts.occupied[:, counts.weekday == day]

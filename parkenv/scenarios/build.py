@@ -30,9 +30,8 @@ from parkenv.scenarios.spec import (
     scenario_specs,
 )
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy.constant_map import ConstantForecast
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.occupancy.process import OccupancyModel, OccupancyProcess, PriorModel
+from parkenv.world.occupancy.process import ConstantForecast, OccupancyModel, OccupancyProcess, PriorModel
 from parkenv.world.occupancy.typical_week import (
     attraction,
     real_week_occupancy,

@@ -7,42 +7,55 @@ the rate has the same gaps, half as long.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
+from pydantic import Field, InstanceOf
 from scipy.optimize import nnls
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.keyed_random import HEADWAY_STREAM, car_uniforms
-from parkenv.errors import InputError, require_number, require_whole
+from parkenv.errors import InputError, require
+from parkenv.files.field_types import NotNegative, Number, Numbers, Positive, Validated, Whole
 from parkenv.files.known_names import MAX_CARS
-from parkenv.world.durations import Duration, numbers_of, parked_share
+from parkenv.world.durations import Duration, LogNormalTime, parked_share, staying_share
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, ArrivalDay, OccupancyModel
 from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S
 
+Second = Annotated[NotNegative, Field(lt=DAY_S)]
 _RARE = 1e-12  # probability of more arrivals than `PoissonArrivals.max_cars`
 _FOLLOWED_S = 300.0  # between the moments at which a lot is compared with its occupancy model
 _NO_RATE = 1e-9  # cars an hour
+STAYS_H = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0, 24.0)
+"""Mean stays that are tried to follow counts, h."""
+STAY_CV = 1.0
+"""Standard deviation of these stays over their mean."""
+TOLERANCE = 0.005
+"""Share of the places by which the fit may be off in the mean, for a longer stay."""
 
 
-class Arrivals(Protocol):
+class Arrivals(ABC):
     """When the cars of a world arrive."""
 
     @property
+    @abstractmethod
     def max_cars(self) -> int:
         """Maximum number of cars of a world."""
 
+    @abstractmethod
     def begin_s(self, arrival_s: float) -> float:
         """Return when the world begins, s of the day; `arrival_s` is the arrival drawn from the scenario's window."""
 
+    @abstractmethod
     def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
         """Draw the arrivals of the world with this key on a day, (n,) ascending s of the day, at least one."""
 
 
 @dataclass(frozen=True)
-class Headways:
+class Headways(Validated, Arrivals):
     """A fixed number of cars: the first arrives at a time in the scenario's arrival window, the others after it.
 
     Args:
@@ -50,33 +63,27 @@ class Headways:
         mean_s: mean of the exponentially distributed times between two arrivals, s.
     """
 
-    cars: int = 1
-    mean_s: float = 10.0
-
-    def __post_init__(self) -> None:
-        require_whole("Headways.cars", self.cars, least=1, most=MAX_CARS)
-        require_number("Headways.mean_s", self.mean_s, above=0.0)
+    cars: Annotated[Whole, Field(ge=1, le=MAX_CARS)] = 1
+    mean_s: Positive = 10.0
 
     @property
     def max_cars(self) -> int:
-        """Number of cars."""
         return self.cars
 
     def begin_s(self, arrival_s: float) -> float:
-        """Return the first car's arrival."""
         return arrival_s
 
-    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
-        """Draw the arrivals; see `Arrivals`."""
-        del day
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:  # noqa: ARG002
         gaps = _gaps(key, self.cars) * self.mean_s
         gaps[0] = 0.0
         return arrival_s + np.cumsum(gaps)
 
 
 @dataclass(frozen=True)
-class PoissonArrivals:
+class PoissonArrivals(Validated, Arrivals):
     """Cars arrive as a Poisson process whose rate may change from hour to hour.
+
+    A world in which nobody would arrive has one car, at the end.
 
     Args:
         per_hour: cars an hour, one number or 24, one for each hour of the day; at least 0, not all 0 in the window.
@@ -84,30 +91,20 @@ class PoissonArrivals:
         end_s: end of the arrivals, s, after `start_s`; above 86400, the rates of the day repeat.
     """
 
-    per_hour: float | tuple[float, ...]
-    start_s: float = 8 * HOUR_S
-    end_s: float = 12 * HOUR_S
+    per_hour: NotNegative | Annotated[Numbers[NotNegative], Field(min_length=DAY_HOURS, max_length=DAY_HOURS)]
+    start_s: Second = 8 * HOUR_S
+    end_s: Number = 12 * HOUR_S
 
     def __post_init__(self) -> None:
-        if np.ndim(self.per_hour) > 0:
-            rates = numbers_of("PoissonArrivals.per_hour", self.per_hour)
-            if len(rates) != DAY_HOURS:
-                raise InputError(
-                    f"PoissonArrivals.per_hour has {len(rates)} numbers, want one or {DAY_HOURS}"
-                )
-            object.__setattr__(self, "per_hour", rates)
-        for rate in np.atleast_1d(self.per_hour):
-            require_number("PoissonArrivals.per_hour", float(rate), least=0.0)
-        _require_second("PoissonArrivals.start_s", self.start_s)
-        require_number("PoissonArrivals.end_s", self.end_s, above=self.start_s)
-        if not self.expected > 0.0:
-            raise InputError(
-                f"PoissonArrivals.per_hour is {self.per_hour!r}, want a rate above 0 in the window: no car would arrive"
-            )
-        if self.max_cars > MAX_CARS:
-            raise InputError(
-                f"PoissonArrivals.per_hour: {self.expected:,.0f} cars arrive in the window, want at most {MAX_CARS:,}"
-            )
+        super().__post_init__()
+        require(
+            self.end_s > self.start_s,
+            f"end_s is {self.end_s}, want a number above start_s, {self.start_s:g}",
+        )
+        require(
+            self.expected > 0.0 and self.max_cars <= MAX_CARS,
+            f"per_hour: {self.expected:,.0f} cars arrive in the window, want more than 0, at most {MAX_CARS:,}",
+        )
 
     @property
     def expected(self) -> float:
@@ -121,23 +118,16 @@ class PoissonArrivals:
 
         return int(poisson.isf(_RARE, self.expected)) + 1
 
-    def begin_s(self, arrival_s: float) -> float:
-        """Return `start_s`."""
-        del arrival_s
+    def begin_s(self, arrival_s: float) -> float:  # noqa: ARG002
         return self.start_s
 
-    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
-        """Draw the arrivals; see `Arrivals`. A world in which nobody would arrive has one car, at the end."""
-        del arrival_s, day
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:  # noqa: ARG002
         times, expected = self._times()
         arrivals = np.cumsum(_gaps(key, self.max_cars))
         arrivals = arrivals[arrivals < expected[-1]]
-        if not len(arrivals):
-            return np.array([self.end_s])
-        return np.asarray(np.interp(arrivals, expected, times))
+        return np.asarray(np.interp(arrivals, expected, times)) if len(arrivals) else np.array([self.end_s])
 
     def _times(self) -> tuple[FloatArray, FloatArray]:
-        """Return full hours in the window, with its ends, s, and the expected number of arrivals until then."""
         times = hours_between(self.start_s, self.end_s)
         rates = np.broadcast_to(np.asarray(self.per_hour, np.float64), DAY_HOURS)
         hour = ((times[:-1] + 1e-9) // HOUR_S).astype(np.int64) % DAY_HOURS
@@ -145,44 +135,30 @@ class PoissonArrivals:
 
 
 @dataclass(frozen=True)
-class FollowingArrivals:
+class FollowingArrivals(Validated, Arrivals):
     """Cars arrive such that a lot becomes as full as its occupancy model says: as counted, recorded or expected.
 
     Residents leave and cars come: the rate of each hour is that with which the expected number of parked cars comes
     closest to the model's, every five minutes (least squares, no rate below 0), were the lot large enough for all. Of
     recorded days, each is followed for itself. A lot that empties faster than cars leave cannot be followed.
-
-    Args:
-        occupancy: the model of the lot.
-        window: weekdays, beginning of the world, and end of the arrivals.
-        stay: law of the time that a car stays in its slot.
-        scale: factor of these arrivals, above 0.
     """
 
-    occupancy: OccupancyModel
-    window: ArrivalWindow
-    stay: Duration
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        require_number("FollowingArrivals.scale", self.scale, above=0.0)
+    occupancy: InstanceOf[OccupancyModel]  # the model of the lot
+    window: InstanceOf[ArrivalWindow]  # weekdays, beginning of the world, and end of the arrivals
+    stay: InstanceOf[Duration]  # law of the time that a car stays in its slot
+    scale: Positive = 1.0  # factor of these arrivals, above 0
 
     @property
     def max_cars(self) -> int:
-        """Maximum number of cars of a day."""
         return max(self.rates_of(day).max_cars for day in self.occupancy.arrival_days(self.window))
 
-    def begin_s(self, arrival_s: float) -> float:
-        """Return the beginning of the window."""
-        del arrival_s
+    def begin_s(self, arrival_s: float) -> float:  # noqa: ARG002
         return self.window.start_s
 
     def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
-        """Draw the arrivals of a day; see `Arrivals`."""
         return self.rates_of(day).draw(key, arrival_s, day)
 
     def rates_of(self, day: ArrivalDay) -> PoissonArrivals:
-        """Return the arrivals of one of the days, with their rates by hour."""
         start, end = self.window.start_s, self.window.end_s
         seconds = np.append(np.arange(start + _FOLLOWED_S, end, _FOLLOWED_S), end).astype(np.float64)
         midnight = day.weekday * DAY_S
@@ -197,89 +173,88 @@ class FollowingArrivals:
 
 
 @dataclass(frozen=True)
-class ListedArrivals:
-    """Cars arrive at given times.
+class ListedArrivals(Validated, Arrivals):
+    """Cars arrive at given times, the same in every world.
 
     Args:
         times_s: s of the day, in [0, 86400), ascending, at least one.
     """
 
-    times_s: tuple[float, ...]
+    times_s: Numbers[Second]
 
     def __post_init__(self) -> None:
-        times = numbers_of("ListedArrivals.times_s", self.times_s)
-        for i, time in enumerate(times):
-            _require_second(f"ListedArrivals.times_s[{i}]", time)
-            if i > 0 and time < times[i - 1]:
-                raise InputError(
-                    f"ListedArrivals.times_s[{i}] is {time}, want at least {times[i - 1]}, the one before"
-                )
-        object.__setattr__(self, "times_s", times)
+        super().__post_init__()
+        if list(self.times_s) != sorted(self.times_s):
+            raise InputError(f"times_s is {self.times_s!r:.60}, want ascending times")
 
     @property
     def max_cars(self) -> int:
-        """Number of cars."""
         return len(self.times_s)
 
-    def begin_s(self, arrival_s: float) -> float:
-        """Return the first arrival."""
-        del arrival_s
+    def begin_s(self, arrival_s: float) -> float:  # noqa: ARG002
         return self.times_s[0]
 
-    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
-        """Return the arrivals; they are the same in every world."""
-        del key, arrival_s, day
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:  # noqa: ARG002
         return np.array(self.times_s)
 
 
 @dataclass(frozen=True)
-class NoArrivals:
-    """Nobody arrives: the cars of a purpose are all parked when the world begins.
+class NoArrivals(Validated, Arrivals):
+    """Nobody arrives: the cars of a purpose are all parked when the world begins, at `start_s` of the day."""
 
-    Args:
-        start_s: beginning of the world, s of the day, in [0, 86400).
-    """
+    start_s: Second
+    max_cars: ClassVar[int] = 0
 
-    start_s: float
-
-    def __post_init__(self) -> None:
-        _require_second("NoArrivals.start_s", self.start_s)
-
-    @property
-    def max_cars(self) -> int:
-        """None."""
-        return 0
-
-    def begin_s(self, arrival_s: float) -> float:
-        """Return `start_s`."""
-        del arrival_s
+    def begin_s(self, arrival_s: float) -> float:  # noqa: ARG002
         return self.start_s
 
-    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
-        """Return no arrival."""
-        del key, arrival_s, day
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:  # noqa: ARG002
         return np.zeros(0)
 
 
+class FollowedCounts(NamedTuple):
+    """Cars with which a car park becomes as full as counted."""
+
+    per_hour: FloatArray  # (n_hours,) cars an hour in the hours of the window
+    stay: LogNormalTime
+    expected: FloatArray  # (n_hours,) cars at the ends of the hours
+
+
+def follow_counts(
+    at_first: float, cars: FloatArray, start_s: float, end_s: float, stays_h: tuple[float, ...] = STAYS_H
+) -> FollowedCounts:
+    """Return the arrivals with which the expected number of cars is nearest to the counts, by least squares.
+
+    Counts, `cars` at the end of each hour, or part of one, of the window, NaN where nobody counted, say how many cars
+    there are, not how often they change, so the stay is not in them. Of the stays that are tried, h, the longest is
+    taken with which the counts can be followed, so that the fewest cars come; else the one that is off least.
+    """
+    edges, known = hours_between(start_s, end_s), np.isfinite(cars)
+    tried = []
+    for hours in sorted(stays_h, reverse=True):
+        stay = LogNormalTime(HOUR_S * hours, STAY_CV)
+        # Those who are there at first leave after the rest of such a stay.
+        rest = at_first * staying_share(stay, edges[1:] - edges[0])
+        there = parked_share(stay, edges, edges[1:])
+        rates, _ = nnls(there[known], (cars - rest)[known])
+        expected = rest + there @ rates
+        off = float(np.abs(expected - cars)[known].mean())
+        tried.append((off, FollowedCounts(rates, stay, expected)))
+        if off <= TOLERANCE * np.nanmax(cars):
+            return tried[-1][1]
+    return min(tried, key=lambda pair: pair[0])[1]
+
+
 def hours_between(start_s: float, end_s: float) -> FloatArray:
-    """Return the full hours between two times, and these, s."""
     hours = np.arange(start_s // HOUR_S + 1, math.ceil(end_s / HOUR_S)) * HOUR_S
     return np.concatenate(([start_s], hours, [end_s]))
 
 
 def uniforms(key: np.uint64, stream: int, n: int) -> FloatArray:
-    """Return the random numbers of the first n cars in a stream, (n,) in (0, 1)."""
     values = np.empty(n)
     car_uniforms(key, stream, 0, values)
     return values
 
 
 def _gaps(key: np.uint64, n: int) -> FloatArray:
-    """Exponential times with mean 1 before each car's arrival."""
     return -np.log(uniforms(key, HEADWAY_STREAM, n))
-
-
-def _require_second(name: str, value: Any) -> None:
-    require_number(name, value, least=0.0)
-    if value >= DAY_S:
-        raise InputError(f"{name} is {value!r}, want seconds of the day in [0, 86400)")

@@ -11,25 +11,15 @@ from typing import NamedTuple
 
 
 class CostTerm(NamedTuple):
-    """A part of the total time.
+    """A part of the total time."""
 
-    Attributes:
-        name: key in `info["reward_terms"]`, where it is negative.
-        field: key of its sum over an episode, s, in `info`, and name of its column in tables and records.
-        label: name for people.
-        help: explanation.
-        color: in pictures and in reports on a light ground.
-        dark_color: in reports on a dark ground.
-        optional: whether pictures and tables leave it out where it is 0 everywhere.
-    """
-
-    name: str
-    field: str
-    label: str
-    help: str
-    color: str
-    dark_color: str
-    optional: bool = False
+    name: str  # key in `info["reward_terms"]`, where it is negative
+    field: str  # key of its sum over an episode, s, in `info`, and name of its column in tables and records
+    label: str  # name for people
+    help: str  # explanation
+    color: str  # in pictures and in reports on a light ground
+    dark_color: str  # in reports on a dark ground
+    optional: bool = False  # whether pictures and tables leave it out where it is 0 everywhere
 
 
 COST_TERMS = (

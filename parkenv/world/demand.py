@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import AfterValidator, Field, InstanceOf
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
@@ -23,7 +24,8 @@ from parkenv.compiled.keyed_random import (
     STAY_STREAM,
     named_key,
 )
-from parkenv.errors import InputError, require_number, require_whole
+from parkenv.errors import InputError, require
+from parkenv.files.field_types import OF_ARRAY, NotNegative, Positive, Probability, Validated, Whole
 from parkenv.files.known_names import MAX_CARS
 from parkenv.world.arrivals import (
     Arrivals,
@@ -40,7 +42,6 @@ from parkenv.world.durations import (
     EmpiricalTime,
     ExponentialTime,
     LogNormalTime,
-    numbers_of,
     rest_of_stay,
 )
 from parkenv.world.occupancy.process import ArrivalDay
@@ -57,35 +58,20 @@ CHARGING = "charging"  # the class of cars that need to charge
 
 
 class CarPlans(NamedTuple):
-    """What is known of the cars of a world before anybody drives, (n,) each, in order of arrival.
+    """What is known of the cars of a world before anybody drives, (n,) each, in order of arrival."""
 
-    Attributes:
-        arrival_s: float64, s of the day.
-        stay_s: float64, s, time in the slot; of parked cars, what is left of it.
-        patience_s: float64, s, length of the search after which the car goes elsewhere.
-        entry: int64, index of the entry.
-        goal: int64, index of the goal among those with a weight.
-        kind: float64 in (0, 1), number that decides the kind of driver.
-        purpose: int64, index of the purpose.
-        value_of_time: float64, value of an hour of the driver's time; NaN: the scenario's.
-        classes: int64, bit k is set for drivers of the class `class_names[k]` of the demand.
-        walks_back: bool, whether the walk back from the goal counts, too.
-        kwh: float64, energy that the car takes where it can charge.
-        parked: bool, whether the car stands in a slot when the world begins; these come first.
-    """
-
-    arrival_s: FloatArray
-    stay_s: FloatArray
-    patience_s: FloatArray
-    entry: IntArray
-    goal: IntArray
-    kind: FloatArray
-    purpose: IntArray
-    value_of_time: FloatArray
-    classes: IntArray
-    walks_back: BoolArray
-    kwh: FloatArray
-    parked: BoolArray
+    arrival_s: FloatArray  # float64, s of the day
+    stay_s: FloatArray  # float64, s, time in the slot; of parked cars, what is left of it
+    patience_s: FloatArray  # float64, s, length of the search after which the car goes elsewhere
+    entry: IntArray  # int64, index of the entry
+    goal: IntArray  # int64, index of the goal among those with a weight
+    kind: FloatArray  # float64 in (0, 1), number that decides the kind of driver
+    purpose: IntArray  # int64, index of the purpose
+    value_of_time: FloatArray  # float64, value of an hour of the driver's time; NaN: the scenario's
+    classes: IntArray  # int64, bit k is set for drivers of the class `class_names[k]` of the demand
+    walks_back: BoolArray  # bool, whether the walk back from the goal counts, too
+    kwh: FloatArray  # float64, energy that the car takes where it can charge
+    parked: BoolArray  # bool, whether the car stands in a slot when the world begins; these come first
 
     @classmethod
     def joined(cls, parts: Sequence[CarPlans]) -> CarPlans:
@@ -95,8 +81,17 @@ class CarPlans(NamedTuple):
         return self._replace(**{name: getattr(self, name)[order] for name in self._fields})
 
 
+def _not_all_0(weights: tuple[float, ...]) -> tuple[float, ...]:
+    if weights and not sum(weights) > 0.0:
+        raise ValueError("finite numbers of at least 0, not all 0")
+    return weights
+
+
+Weights = Annotated[tuple[NotNegative, ...], OF_ARRAY, AfterValidator(_not_all_0)]
+
+
 @dataclass(frozen=True)
-class Demand:
+class Demand(Validated):
     """The demand for parking in one lot, of drivers with one purpose; `TownDemand` is that of several.
 
     Args:
@@ -120,36 +115,17 @@ class Demand:
         InputError: a value out of its range; the message names the field.
     """
 
-    arrivals: Arrivals = field(default_factory=Headways)
-    stay: Duration = field(default_factory=lambda: ExponentialTime(HOUR_S))
-    patience: Duration = field(default_factory=lambda: ConstantTime(math.inf))
-    entry_weights: tuple[float, ...] = ()
-    goal_weights: tuple[float, ...] = ()
+    arrivals: InstanceOf[Arrivals] = field(default_factory=Headways)
+    stay: InstanceOf[Duration] = field(default_factory=lambda: ExponentialTime(HOUR_S))
+    patience: InstanceOf[Duration] = field(default_factory=lambda: ConstantTime(math.inf))
+    entry_weights: Weights = ()
+    goal_weights: Weights = ()
     name: str = ""
-    value_of_time: float | None = None
-    classes: Mapping[str, float] = field(default_factory=dict)
+    value_of_time: Positive | None = None
+    classes: Annotated[dict[str, Probability], Field(max_length=MAX_CLASSES)] = field(default_factory=dict)
     walks_back: bool = False
-    kwh: float = 0.0
-    parked: int = 0
-
-    def __post_init__(self) -> None:
-        for name, wanted in (("arrivals", "draw"), ("stay", "quantile"), ("patience", "quantile")):
-            value = getattr(self, name)
-            if not hasattr(value, wanted):
-                examples = (
-                    "arrivals such as Headways" if name == "arrivals" else "a law such as ExponentialTime"
-                )
-                raise InputError(f"Demand.{name} is {value!r:.60}, want {examples}")
-        for name in ("entry_weights", "goal_weights"):
-            object.__setattr__(self, name, _weights(f"Demand.{name}", getattr(self, name)))
-        if self.value_of_time is not None:
-            require_number("Demand.value_of_time", self.value_of_time, above=0.0)
-        for name, share in self.classes.items():
-            require_number(f"Demand.classes[{name!r}]", share, least=0.0, most=1.0)
-        if len(self.classes) > MAX_CLASSES:
-            raise InputError(f"Demand.classes has {len(self.classes)} names, want at most {MAX_CLASSES}")
-        require_number("Demand.kwh", self.kwh, least=0.0)
-        require_whole("Demand.parked", self.parked, most=MAX_CARS)
+    kwh: NotNegative = 0.0
+    parked: Annotated[Whole, Field(le=MAX_CARS)] = 0
 
     @property
     def purposes(self) -> tuple[Demand, ...]:
@@ -239,20 +215,24 @@ class TownDemand:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "purposes", tuple(self.purposes))
-        names = [one.name for one in self.purposes]
+        names = [purpose.name for purpose in self.purposes]
         if not names or len(set(names)) < len(names):
             raise InputError(f"TownDemand.purposes are named {names}, want at least one, of different names")
-        if not any(one.arrivals.max_cars for one in self.purposes):
-            raise InputError("TownDemand.purposes: nobody arrives, want a rate above 0 in the window")
+        require(
+            any(purpose.arrivals.max_cars for purpose in self.purposes),
+            "TownDemand.purposes: nobody arrives, want a rate above 0 in the window",
+        )
         for name in ("entry_weights", "goal_weights"):
-            if len({len(getattr(one, name)) for one in self.purposes}) > 1:
+            if len({len(getattr(purpose, name)) for purpose in self.purposes}) > 1:
                 raise InputError(f"TownDemand.purposes: {name} are of different lengths, want one for all")
-        if self.max_cars > MAX_CARS:
-            raise InputError(f"TownDemand.purposes: {self.max_cars:,} cars, want at most {MAX_CARS:,}")
-        if len(self.class_names) > MAX_CLASSES:
-            raise InputError(
-                f"TownDemand.purposes have {len(self.class_names)} classes, want at most {MAX_CLASSES}"
-            )
+        require(
+            self.max_cars <= MAX_CARS,
+            f"TownDemand.purposes: {self.max_cars:,} cars, want at most {MAX_CARS:,}",
+        )
+        require(
+            len(self.class_names) <= MAX_CLASSES,
+            f"TownDemand.purposes have {len(self.class_names)} classes, want at most {MAX_CLASSES}",
+        )
 
     @property
     def entry_weights(self) -> tuple[float, ...]:
@@ -267,33 +247,33 @@ class TownDemand:
     @property
     def class_names(self) -> tuple[str, ...]:
         """Names of the classes, in the order of the bits of `CarPlans.classes`."""
-        return tuple(dict.fromkeys(name for one in self.purposes for name in one.classes))
+        return tuple(dict.fromkeys(name for purpose in self.purposes for name in purpose.classes))
 
     @property
     def max_cars(self) -> int:
         """Maximum number of cars of a world."""
-        return sum(one.max_cars for one in self.purposes)
+        return sum(purpose.max_cars for purpose in self.purposes)
 
     @property
     def expected(self) -> float:
         """Expected number of arrivals."""
-        return sum(one.expected for one in self.purposes)
+        return sum(purpose.expected for purpose in self.purposes)
 
     def begin_s(self, arrival_s: float) -> float:
         """Return when the world begins, s of the day: with the first purpose."""
-        return min(one.begin_s(arrival_s) for one in self.purposes)
+        return min(purpose.begin_s(arrival_s) for purpose in self.purposes)
 
     def scaled(self, factor: float) -> TownDemand:
         """Return the demand with so many times the arrivals, and the same cars parked."""
-        return TownDemand(tuple(one.scaled(factor) for one in self.purposes))
+        return TownDemand(tuple(purpose.scaled(factor) for purpose in self.purposes))
 
     def draw(self, key: np.uint64, arrival_s: float, n_entries: int, day: ArrivalDay) -> CarPlans:
         """Draw the cars of the world with this key; see `Demand.draw`."""
         bits, drawn = {name: bit for bit, name in enumerate(self.class_names)}, []
-        for number, one in enumerate(self.purposes):
-            plans = one.draw(key, arrival_s, n_entries, day)
+        for number, purpose in enumerate(self.purposes):
+            plans = purpose.draw(key, arrival_s, n_entries, day)
             classes = np.zeros_like(plans.classes)
-            for bit, name in enumerate(one.classes):
+            for bit, name in enumerate(purpose.classes):
                 classes |= (plans.classes >> bit & 1) << bits[name]
             drawn.append(plans._replace(purpose=np.full_like(classes, number), classes=classes))
         plans = CarPlans.joined(drawn)
@@ -302,7 +282,6 @@ class TownDemand:
 
 
 def weights_of_all(weights: Mapping[str, FloatArray]) -> tuple[float, ...]:
-    """Return the weights of a lot's entries or goals over all purposes; none if it has none."""
     return tuple(np.sum([*weights.values()], axis=0).tolist()) if weights else ()
 
 
@@ -311,12 +290,3 @@ def _choices(u: FloatArray, weights: Sequence[float]) -> IntArray:
         return (u * len(weights)).astype(np.int64)
     shares = np.cumsum(weights) / np.sum(weights)
     return np.minimum(np.searchsorted(shares, u, side="right"), len(weights) - 1).astype(np.int64)
-
-
-def _weights(name: str, values: Sequence[float]) -> tuple[float, ...]:
-    if not len(values):
-        return ()
-    weights = numbers_of(name, values)
-    if not all(math.isfinite(w) and w >= 0.0 for w in weights) or not sum(weights) > 0.0:
-        raise InputError(f"{name} is {values!r:.60}, want finite numbers of at least 0, not all 0")
-    return weights

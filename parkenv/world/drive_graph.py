@@ -4,7 +4,8 @@ Every slot has one vertex, the point on the lane before its mouth; lane ends and
 A two-way lane has one directed chain of slot vertices per side, to the right of the centre line: a car passes the
 slots on its right in order, turns round at the ends of the lane, and may cross to the opposite slots. A one-way lane
 has a single chain that serves both sides. A junction has one vertex, and one more for each chain whose cars may not
-turn everywhere there (`turns`). All computations are vectorised: a million slots take seconds.
+turn everywhere there: the chain ends at it, and its edges are the permitted turns. All computations are vectorised: a
+million slots take seconds.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -21,9 +23,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
-from parkenv.world.turns import Chains, TurnParts, forbidden_after
 
 LANE_OFFSET = 1.5
 """Distance, m, of a slot's vertex from the centre line of a two-way lane, to the right of travel."""
@@ -33,6 +34,15 @@ VERTEX_SPACING = 1.0
 """Least distance, m, between two slot vertices of one chain, so that every move takes time."""
 CROSSING_REACH = 3.0  # greatest distance, m along the lane, of a move across to a slot on the other side
 NODE_TOLERANCE = 1e-3  # lane points closer than this, m, are one node
+
+
+SAME_WAY = np.cos(np.radians(30.0))
+"""Cosine of the largest angle between the point that a turn names and the lane that it means."""
+SAME_NODE = 0.01  # m, between the middle point of a turn and the junction that it means
+
+TurnParts = tuple[FloatArray, bool]
+"""Three points of a turn: on the lane by which cars come, the junction, on the lane by which they leave; and whether it
+is the only one that they may make."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,24 @@ class DriveGraph:
     entry_vertices: IntArray  # (n_entries,) int64, the vertex of each entry
 
 
+class Chains(NamedTuple):
+    """The directions of all segments of lanes between nodes: chain 2k runs along segment k, 2k + 1 against it."""
+
+    first: IntArray  # (2n,) int64, node where each begins and where it ends
+    last: IntArray
+    leaving: FloatArray  # (2n, 2) float64, unit vector, its direction at its first node
+    drivable: BoolArray  # (2n,) bool, whether cars may drive it
+    node_xy: FloatArray  # (n_nodes, 2) float64, m
+
+    def onward(self, chain: int) -> IntArray:
+        return np.flatnonzero((self.first == self.last[chain]) & self.drivable)
+
+
+class Rule(NamedTuple):
+    chain: int
+    forbidden: IntArray
+
+
 @dataclass(frozen=True, eq=False)
 class Centrelines:
     """All lanes in one array of points; `station` is the cumulative length along it.
@@ -88,7 +116,6 @@ class Centrelines:
 
     @cached_property
     def chains(self) -> Chains:
-        """The two directions of each segment."""
         n = len(self.segment_oneway)
         segment = np.arange(n)
         # The first leg of a segment starts at its start, the last leg ends at its end.
@@ -215,7 +242,6 @@ def _with_entry_points(
 
 
 def linestrings(parts: Sequence[FloatArray]) -> NDArray[np.object_]:
-    """Shapely lines, (len(parts),), through (k, 2) points each."""
     which = np.repeat(np.arange(len(parts)), [len(points) for points in parts])
     return np.atleast_1d(np.asarray(shapely.linestrings(np.concatenate(parts), indices=which)))
 
@@ -226,14 +252,12 @@ def node_labels(xy: FloatArray) -> IntArray:
 
 
 def component_labels(links: IntArray, n: int) -> IntArray:
-    """Label n things, (n,) int64: those that links, (m, 2) indices, connect share a label."""
     links = np.reshape(links, (-1, 2))
     graph = coo_array((np.ones(len(links), dtype=bool), tuple(links.T)), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def centrelines(lanes: Sequence[LaneParts]) -> Centrelines:
-    """Cut lanes into segments where they meet."""
     xy = np.concatenate([centre for centre, _, _ in lanes])
     count = np.array([len(centre) for centre, _, _ in lanes])
     oneway, speed = (np.array([lane[k] for lane in lanes]) for k in (1, 2))
@@ -407,7 +431,6 @@ def _crossing_edges(
     segment: IntArray,
     against: NDArray[np.bool_],
 ) -> list[Edges]:
-    """Edges from a slot's vertex across a two-way lane to the nearest vertex of the other side."""
     edges = []
     two_way = ~lines.segment_oneway[segment]
     for side in (False, True):
@@ -481,3 +504,75 @@ def _four_columns(
     at = source, column[source, rank]
     neighbors[at], edge_length[at], edge_speed[at] = target, length, speed[order]
     return neighbors, edge_length, edge_speed
+
+
+# ---- turn restrictions: which turns a car may make depends on the chain by which it reaches the junction
+
+
+def rules_of(chains: Chains, turns: Sequence[TurnParts]) -> list[Rule | str]:
+    if not turns:
+        return []
+    far, nearest = cKDTree(chains.node_xy).query([points[1] for points, _ in turns])
+    at = zip(turns, np.atleast_1d(far).tolist(), np.atleast_1d(nearest).tolist(), strict=True)
+    return [
+        _rule_at(chains, node, turn)
+        if away <= SAME_NODE
+        else f"has no junction or end of a lane at {_place(turn[0][1])}"
+        for turn, away, node in at
+    ]
+
+
+def _rule_at(chains: Chains, node: int, turn: TurnParts) -> Rule | str:
+    (before, at, after), only = turn
+    arms = np.flatnonzero(chains.first == node)
+    comes, leaves = (_arm(chains, arms, point - at) for point in (before, after))
+    if comes < 0 or not chains.drivable[comes ^ 1]:
+        return f"has no lane by which cars come from {_place(before)} to {_place(at)}"
+    if leaves < 0 or not chains.drivable[leaves]:
+        return f"has no lane by which cars leave {_place(at)} for {_place(after)}"
+    out = chains.onward(comes ^ 1)
+    return Rule(comes ^ 1, out[out != leaves] if only else out[out == leaves])
+
+
+def _arm(chains: Chains, arms: IntArray, way: FloatArray) -> int:
+    alike = chains.leaving[arms] @ way / max(float(np.hypot(*way)), 1e-9)
+    return int(arms[alike.argmax()]) if alike.max() >= SAME_WAY else -1
+
+
+def _place(xy: FloatArray) -> str:
+    return f"({xy[0]:.1f}, {xy[1]:.1f}) m"
+
+
+def forbidden_after(chains: Chains, turns: Sequence[TurnParts]) -> tuple[dict[int, IntArray], dict[int, str]]:
+    """Return which chains cars may not take after each chain with turns, and what is wrong with turns, by number."""
+    wrong: dict[int, str] = {}
+    forbidden: dict[int, IntArray] = {}
+    for number, rule in enumerate(rules_of(chains, turns)):
+        if isinstance(rule, str):
+            wrong[number] = rule
+            continue
+        together = np.union1d(forbidden.get(rule.chain, rule.forbidden), rule.forbidden)
+        if len(together) == len(chains.onward(rule.chain)):
+            wrong[number] = f"prohibits the last turn that cars may make at {_place(turns[number][0][1])}"
+        else:
+            forbidden[rule.chain] = together
+    return forbidden, wrong
+
+
+def connected(chains: Chains, rules: Sequence[Rule]) -> BoolArray:
+    """Return which chains are in the largest part in which each leads to every other one, (2n,) bool."""
+    drivable = np.flatnonzero(chains.drivable)
+    out = drivable[np.argsort(chains.first[drivable], kind="stable")]
+    begin, end = (
+        np.searchsorted(chains.first[out], chains.last[drivable], side) for side in ("left", "right")
+    )
+    source = np.repeat(drivable, end - begin)
+    target = out[
+        np.arange(len(source)) + np.repeat(begin - np.r_[0, np.cumsum(end - begin)[:-1]], end - begin)
+    ]
+    n = len(chains.first)
+    forbidden = np.concatenate([np.empty(0, np.int64), *(rule.chain * n + rule.forbidden for rule in rules)])
+    free = ~np.isin(source * n + target, forbidden)
+    graph = coo_array((np.ones(int(free.sum()), bool), (source[free], target[free])), shape=(n, n))
+    part = connected_components(graph, connection="strong")[1]
+    return chains.drivable & (part == np.bincount(part[drivable]).argmax())  # type: ignore[no-any-return]

@@ -3,75 +3,67 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
+from pydantic import Field
 from scipy.special import ndtri
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, require_number
+from parkenv.files.field_types import NumberOrInf, Numbers, Positive, Validated
 from parkenv.world.week import HOUR_S
 
 QUANTILES = 400
 """Number of equally probable stays that stand for their law."""
 
 
-class Duration(Protocol):
-    """A law of durations, s."""
+class Duration(ABC):
+    """A law of durations, s, with the mean `mean_s`."""
 
-    @property
-    def mean_s(self) -> float:
-        """Mean, s."""
+    mean_s: float
 
+    @abstractmethod
     def quantile(self, u: FloatArray) -> FloatArray:
         """Return the durations, (k,) s, that are exceeded with probability 1 - u, for u in (0, 1)."""
 
 
 @dataclass(frozen=True)
-class ConstantTime:
+class ConstantTime(Validated, Duration):
     """Always the same duration.
 
     Args:
         seconds: s, above 0; infinite: for ever.
     """
 
-    seconds: float
-
-    def __post_init__(self) -> None:
-        require_number("ConstantTime.seconds", self.seconds, above=0.0, finite=False)
+    seconds: Annotated[NumberOrInf, Field(gt=0.0)]
 
     @property
-    def mean_s(self) -> float:
+    def mean_s(self) -> float:  # type: ignore[override]
         """Mean, s."""
         return self.seconds
 
     def quantile(self, u: FloatArray) -> FloatArray:
-        """Return the durations; see `Duration`."""
         return np.full(len(u), float(self.seconds))
 
 
 @dataclass(frozen=True)
-class ExponentialTime:
+class ExponentialTime(Validated, Duration):
     """Exponentially distributed durations.
 
     Args:
         mean_s: s, above 0 and finite.
     """
 
-    mean_s: float
-
-    def __post_init__(self) -> None:
-        require_number("ExponentialTime.mean_s", self.mean_s, above=0.0)
+    mean_s: Positive
 
     def quantile(self, u: FloatArray) -> FloatArray:
-        """Return the durations; see `Duration`."""
         return -self.mean_s * np.log1p(-u)
 
 
 @dataclass(frozen=True)
-class LogNormalTime:
+class LogNormalTime(Validated, Duration):
     """Log-normally distributed durations.
 
     Args:
@@ -79,41 +71,30 @@ class LogNormalTime:
         cv: coefficient of variation, standard deviation over mean, above 0.
     """
 
-    mean_s: float
-    cv: float = 1.0
-
-    def __post_init__(self) -> None:
-        require_number("LogNormalTime.mean_s", self.mean_s, above=0.0)
-        require_number("LogNormalTime.cv", self.cv, above=0.0)
+    mean_s: Positive
+    cv: Positive = 1.0
 
     def quantile(self, u: FloatArray) -> FloatArray:
-        """Return the durations; see `Duration`."""
         variance = math.log1p(self.cv**2)
         return np.asarray(self.mean_s * np.exp(math.sqrt(variance) * ndtri(u) - variance / 2))
 
 
 @dataclass(frozen=True)
-class EmpiricalTime:
+class EmpiricalTime(Validated, Duration):
     """Durations drawn from a list, all with equal probability.
 
     Args:
         values_s: s, at least one, all above 0 and finite.
     """
 
-    values_s: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "values_s", numbers_of("EmpiricalTime.values_s", self.values_s))
-        for i, value in enumerate(self.values_s):
-            require_number(f"EmpiricalTime.values_s[{i}]", value, above=0.0)
+    values_s: Numbers[Positive]
 
     @property
-    def mean_s(self) -> float:
+    def mean_s(self) -> float:  # type: ignore[override]
         """Mean, s."""
         return float(np.mean(self.values_s))
 
     def quantile(self, u: FloatArray) -> FloatArray:
-        """Return the durations; see `Duration`."""
         values = np.sort(self.values_s)
         return np.asarray(values[(u * len(values)).astype(np.int64)])
 
@@ -135,7 +116,6 @@ def staying_share(stay: Duration, since_s: FloatArray) -> FloatArray:
 
 
 def _equally_likely(stay: Duration) -> FloatArray:
-    """Return stays that stand for their law, s, ascending."""
     return stay.quantile((np.arange(QUANTILES) + 0.5) / QUANTILES)
 
 
@@ -150,14 +130,3 @@ def rest_of_stay(stay: Duration, u: FloatArray) -> FloatArray:
     until = np.cumsum(stays) / stays.sum()
     met = np.minimum(np.searchsorted(until, u, side="right"), QUANTILES - 1)
     return np.asarray((until[met] - u) * stays.sum())
-
-
-def numbers_of(name: str, values: ArrayLike) -> tuple[float, ...]:
-    """Return a list of numbers, at least one, as floats."""
-    try:
-        array = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} is {values!r:.60}, want numbers") from None
-    if array.ndim != 1 or not array.size:
-        raise InputError(f"{name} has shape {array.shape}, want a list of at least one number")
-    return tuple(map(float, array))

@@ -33,28 +33,21 @@ class Facility(Validated):
 
     It groups the slots of a lot that name it or, with a capacity, it is *counted*: one slot of the lot, at the lane
     nearest to its point, that is taken while the facility is full.
-
-    Args:
-        name: its name; of a counted one, also the id of its slot.
-        kind: `kerb`, `lot` (a car park) or `garage`.
-        zone: zone of its slots that name none; empty: none.
-        capacity: number of cars of a counted facility; 0: it groups drawn slots.
-        xy: m, where a counted facility is entered and people begin to walk.
-        gate_s: s that the barrier of a counted facility takes for each car; cars wait for each other.
-        inside_s: s from the barrier to a space when a counted facility is empty and when it is full; linear between.
-        known: what drivers know of it: `nothing`, `sign` or `live`.
-        delay_s: s by which a live count lags behind.
     """
 
-    name: Annotated[Name, Field(min_length=1)]
-    kind: str = "lot"
-    zone: Name = ""
+    name: Annotated[Name, Field(min_length=1)]  # its name; of a counted one, also the id of its slot
+    kind: str = "lot"  # `kerb`, `lot` (a car park) or `garage`
+    zone: Name = ""  # zone of its slots that name none; empty: none
+    # number of cars of a counted facility; 0: it groups drawn slots
     capacity: Annotated[Whole, Field(le=1_000_000)] = 0
+    # m, where a counted facility is entered and people begin to walk
     xy: Annotated[tuple[Number, Number], BeforeValidator(_two_numbers)] | None = None
+    # s that the barrier of a counted facility takes for each car; cars wait for each other
     gate_s: NotNegative = 0.0
+    # s from the barrier to a space when a counted facility is empty and when it is full; linear between
     inside_s: Annotated[tuple[NotNegative, NotNegative], BeforeValidator(_two_numbers)] = (0.0, 0.0)
-    known: str = "nothing"
-    delay_s: NotNegative = 0.0
+    known: str = "nothing"  # what drivers know of it: `nothing`, `sign` or `live`
+    delay_s: NotNegative = 0.0  # s by which a live count lags behind
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,7 +58,6 @@ class Facility(Validated):
 
     @property
     def is_counted(self) -> bool:
-        """Whether its cars are counted, not its slots drawn."""
         return self.capacity > 0
 
 
@@ -107,6 +99,5 @@ def nominal_slots(
 
 
 def facility_problem(facility: Facility, index: int, reason: str) -> GraphProblem:
-    """Return what keeps cars from a counted facility, by its name."""
     assert facility.xy is not None
     return GraphProblem("facility", index, f"{facility.name!r:.40} {reason}", facility.xy)

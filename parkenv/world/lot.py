@@ -10,12 +10,12 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.errors import InputError, nearest, require_number
-from parkenv.files.field_types import Flag, Number, Validated
+from parkenv.errors import InputError, naming, nearest, require
+from parkenv.files.field_types import Flag, Number, Validated, as_array
 from parkenv.files.file_names import is_plain
 from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
 from parkenv.world.facility import NOMINAL_SLOT, Facility, facility_problem, nominal_slots
@@ -31,6 +31,7 @@ PARK = len(MOVES)  # the action "park" (eq. 3.14); lower actions are the moves.
 ACTIONS = (*MOVES, "park")
 FARTHEST = 1e8  # largest coordinate, m: enough for any map grid, and small enough for millimetres in float64
 SLOT_SIDE = 0.1  # least length and width of a slot, m
+_OPTIONAL = ("slot_parking_cost_s", "slot_zone", "slot_facility")
 
 
 class Mouth(IntEnum):
@@ -42,8 +43,6 @@ class Mouth(IntEnum):
 
 
 class _ByValue:
-    """What equals another one of its class if all fields do, arrays among them."""
-
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
             return NotImplemented
@@ -73,10 +72,7 @@ class Lane(Validated, _ByValue):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        points = _frozen(self.points, "points")
-        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
-            raise InputError(f"lane points: shape {points.shape}, want (at least 2, 2)")
-        _require_finite("lane points", points)
+        points = as_array("lane points", self.points, -2, 2, least=-FARTHEST, most=FARTHEST)
         step = np.diff(points, axis=0)
         short = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) <= NODE_TOLERANCE)
         if len(short):
@@ -86,23 +82,16 @@ class Lane(Validated, _ByValue):
 
 @dataclass(frozen=True, eq=False)
 class Turn(Validated, _ByValue):
-    """A turn restriction: a turn at a junction that is prohibited, or mandatory.
+    """A turn restriction: a turn at a junction that is prohibited, or mandatory."""
 
-    Args:
-        points: (3, 2) float64, m, lot frame: a point on the lane by which cars come, the junction, and a point on the
-            lane by which they leave; the first and the last one are the same where cars turn back.
-        only: whether the turn is mandatory: all others from its lane are prohibited.
-    """
-
+    # (3, 2) float64, m, lot frame: a point on the lane by which cars come, the junction, and a point on the lane by
+    # which they leave; the first and the last one are the same where cars turn back
     points: FloatArray
-    only: Flag = False
+    only: Flag = False  # whether the turn is mandatory: all others from its lane are prohibited
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        points = _frozen(self.points, "points")
-        if points.shape != (3, 2):
-            raise InputError(f"turn points: shape {points.shape}, want (3, 2)")
-        _require_finite("turn points", points)
+        points = as_array("turn points", self.points, 3, 2, least=-FARTHEST, most=FARTHEST)
         object.__setattr__(self, "points", points)
 
 
@@ -207,44 +196,11 @@ class ParkingLot(_ByValue):
     def __post_init__(self) -> None:
         for name in ("slot_ids", "lanes", "turns", "facilities"):
             self._set(name, tuple(getattr(self, name)))
-        self._set_counted()
-        self._require_names()
-        n = len(self.slot_ids)
-        if np.size(self.slot_parking_cost_s) == 0:
-            self._set("slot_parking_cost_s", np.zeros(n))
-        self._set_facilities()
-        self._set_zones()
-        for name, shape in (
-            ("slot_xy", (n, 2)),
-            ("slot_yaw", (n,)),
-            ("slot_length", (n,)),
-            ("slot_width", (n,)),
-            ("slot_parking_cost_s", (n,)),
-            ("entries", (len(self.entries), 2)),
-            ("goals", (len(self.goals), 2)),
-        ):
-            values = _frozen(getattr(self, name), name)
-            if values.shape != shape:
-                raise InputError(f"lot {self.name!r}: {name} has shape {values.shape}, want {shape}")
-            _require_finite(f"lot {self.name!r}: {name}", values)
-            self._set(name, values)
-        for name, least in (
-            ("slot_length", SLOT_SIDE),
-            ("slot_width", SLOT_SIDE),
-            ("slot_parking_cost_s", 0.0),
-        ):
-            if (value := getattr(self, name).min()) < least:
-                raise InputError(f"lot {self.name!r}: {name} {value:g}, want at least {least:g}")
-        mouth = np.array(self.slot_mouth, dtype=np.int8)
-        if mouth.shape != (n,) or not np.isin(mouth, list(Mouth)).all():
-            raise InputError(f"lot {self.name!r}: slot_mouth must hold {n} values of {list(map(int, Mouth))}")
-        mouth.flags.writeable = False
-        self._set("slot_mouth", mouth)
-        self._set_walls()
-        for kind, features in (("lane", self.lanes), ("entry", self.entries), ("goal", self.goals)):
-            if len(features) == 0:
-                raise InputError(f"lot {self.name!r} has no {kind}")
-
+        _add_counted(self)
+        with naming(f"lot {self.name!r}"):
+            self._set_features()
+            self._set_facilities()
+            self._set_rules(self.zone_rules)
         graph = build_drive_graph(
             [(lane.points, lane.oneway, lane.speed) for lane in self.lanes],
             self.mouth_xy(),
@@ -253,134 +209,84 @@ class ParkingLot(_ByValue):
             self.side,
         )
         for name in ("vertex_xy", "vertex_yaw", "neighbors", "edge_length", "edge_speed", "entry_vertices"):
-            values = getattr(graph, name)
-            values.flags.writeable = False
-            self._set(name, values)
-        self._require_reachable()
-        for name, points in (("goal_weights", self.goals), ("entry_weights", self.entries)):
-            self._set(name, self._weights(name, len(points)))
+            self._set(name, getattr(graph, name))
+        _require_reachable(self)
 
     def _set(self, name: str, value: object) -> None:
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
         object.__setattr__(self, name, value)
 
-    def _set_walls(self) -> None:
-        walls = tuple(_frozen(wall, "walls") for wall in self.walls)
-        for wall in walls:
-            if wall.ndim != 2 or wall.shape[1] != 2 or len(wall) < 2:
-                raise InputError(f"lot {self.name!r}: a wall has shape {wall.shape}, want (at least 2, 2)")
-            _require_finite(f"lot {self.name!r}: walls", wall)
-        self._set("walls", walls)
-
-    def _set_counted(self) -> None:
-        """Append the slots of counted facilities that are missing, and place all of them beside their lanes."""
-        counted = [facility for facility in self.facilities if facility.is_counted]
-        if not counted:
-            return
-        names, n = tuple(facility.name for facility in counted), len(self.slot_ids)
-        there = self.slot_ids[max(n - len(names), 0) :] == names
-        drawn = n - len(names) if there else n
-        xy, yaw = (
-            nominal_slots(self.facilities, [lane.points for lane in self.lanes])
-            if self.lanes
-            else (np.zeros((len(counted), 2)), np.zeros(len(counted)))
-        )
-        self._set("slot_ids", self.slot_ids[:drawn] + names)
-        for name, values in (
-            ("slot_xy", xy),
-            ("slot_yaw", yaw),
-            ("slot_length", np.full(len(names), NOMINAL_SLOT[0])),
-            ("slot_width", np.full(len(names), NOMINAL_SLOT[1])),
-            ("slot_mouth", np.full(len(names), Mouth.REAR)),
-            ("slot_parking_cost_s", np.zeros(len(names))),
-            ("slot_zone", np.array([facility.zone for facility in counted], np.str_)),
-            ("slot_facility", np.array(names, np.str_)),
+    def _set_features(self) -> None:
+        n, within = len(self.slot_ids), {"least": -FARTHEST, "most": FARTHEST}
+        for kind, features in (
+            ("slot", self.slot_ids), ("lane", self.lanes), ("entry", self.entries), ("goal", self.goals),
+        ):  # fmt: skip
+            require(len(features) > 0, f"has no {kind}")
+        if repeated := [name for name, count in Counter(self.slot_ids).items() if count > 1]:
+            raise InputError(f"slot id {repeated[0]!r} appears twice")
+        for name, shape, dtype, least in (
+            ("slot_xy", (n, 2), np.float64, -FARTHEST),
+            ("slot_yaw", (n,), np.float64, -FARTHEST),
+            ("slot_length", (n,), np.float64, SLOT_SIDE),
+            ("slot_width", (n,), np.float64, SLOT_SIDE),
+            ("slot_mouth", (n,), np.int8, None),
+            ("entries", (-1, 2), np.float64, -FARTHEST),
+            ("goals", (-1, 2), np.float64, -FARTHEST),
+            ("slot_parking_cost_s", (n,), np.float64, 0.0),
+            ("slot_zone", (n,), np.str_, None),
+            ("slot_facility", (n,), np.str_, None),
         ):
-            column = np.asarray(getattr(self, name))
-            if column.size == 0 and drawn:
-                column = np.zeros(drawn, values.dtype)
-            if len(column) not in (drawn, n):
-                raise InputError(f"lot {self.name!r}: {name} has {len(column)} values, want {n}")
-            self._set(name, np.concatenate([column[:drawn].reshape(-1, *values.shape[1:]), values]))
+            values = getattr(self, name)
+            if name in _OPTIONAL and np.size(values) == 0:
+                values = np.zeros(shape, dtype)
+            self._set(name, as_array(name, values, *shape, dtype=dtype, least=least, most=FARTHEST))
+        if not np.isin(self.slot_mouth, list(Mouth)).all():
+            raise InputError(f"slot_mouth must hold {n} values of {list(map(int, Mouth))}")
+        self._set("walls", tuple(as_array("walls", wall, -2, 2, **within) for wall in self.walls))
+        for name, count in (("goal_weights", len(self.goals)), ("entry_weights", len(self.entries))):
+            weights = getattr(self, name).items()
+            self._set(
+                name, {key: as_array(f"{name}[{key!r:.40}]", w, count, least=0.0) for key, w in weights}
+            )
+        for name in (self.name, *self.slot_ids, *self.slot_zone.tolist()):
+            require(is_plain(name), f"name {name!a:.60} has control characters")
 
     def _set_facilities(self) -> None:
-        n, what = len(self.slot_ids), f"lot {self.name!r}"
         names = [facility.name for facility in self.facilities]
-        order = {name: i for i, name in enumerate(names)}
-        if len(order) < len(names):
-            repeated = next(name for i, name in enumerate(names) if name in names[:i])
-            raise InputError(f"{what}: facility {repeated!r:.40} appears twice")
-        given = np.array(self.slot_facility if np.size(self.slot_facility) else [""] * n, dtype=np.str_)
-        if given.shape != (n,):
-            raise InputError(f"{what}: slot_facility has shape {given.shape}, want ({n},)")
-        for name in set(given.tolist()) - {"", *names}:
-            raise InputError(f"{what} has no facility {name!r:.40}; {nearest(name, names)}")
-        index = np.array([order.get(name, -1) for name in given.tolist()], np.int64)
-        capacity = np.ones(n, np.int64)
-        n_slots = np.bincount(index[index >= 0], minlength=len(names))
-        for i, facility in enumerate(self.facilities):
-            if n_slots[i] == 0:
-                raise InputError(f"{what}: facility {facility.name!r:.40} has neither a capacity nor slots")
-            if facility.is_counted and n_slots[i] > 1:
-                raise InputError(
-                    f"{what}: facility {facility.name!r:.40} has a capacity, want no slots that name it"
-                )
-            if facility.is_counted:
-                capacity[index == i] = facility.capacity
-        for name, values in (("slot_facility", given), ("facility_of_slot", index), ("capacity", capacity)):
-            values.flags.writeable = False
-            self._set(name, values)
+        if repeated := [name for name, count in Counter(names).items() if count > 1]:
+            raise InputError(f"facility {repeated[0]!r:.40} appears twice")
+        for name in set(self.slot_facility.tolist()) - {"", *names}:
+            raise InputError(f"no facility {name!r:.40}; {nearest(name, names)}")
+        order = {"": -1} | {name: i for i, name in enumerate(names)}
+        index = np.array([order[name] for name in self.slot_facility.tolist()], np.int64)
+        n_slots = np.bincount(index[index >= 0], minlength=len(names)).tolist()
+        for facility, n in zip(self.facilities, n_slots, strict=True):
+            require(n > 0, f"facility {facility.name!r:.40} has neither a capacity nor slots")
+            if facility.is_counted and n > 1:
+                raise InputError(f"facility {facility.name!r:.40} has a capacity, want no slots that name it")
+        # One more for the index -1.
+        inherited = np.array([*(facility.zone for facility in self.facilities), ""])
+        zone = np.where(self.slot_zone == "", inherited[index], self.slot_zone)
+        capacity = np.array([*(facility.capacity for facility in self.facilities), 0], np.int64)
+        zones, zone_of_slot = np.unique(np.where(zone == "", NO_ZONE, zone), return_inverse=True)
+        for name, value in (
+            ("facility_of_slot", index),
+            ("capacity", np.maximum(capacity[index], 1)),
+            ("slot_zone", zone),
+            ("zones", tuple(zones.tolist())),
+            ("zone_of_slot", zone_of_slot.astype(np.int64)),
+        ):
+            self._set(name, value)
 
-    def _require_reachable(self) -> None:
-        counted = np.flatnonzero(self.is_counted)
-        if not len(counted):
-            return
-        from scipy.sparse.csgraph import dijkstra
-
-        reached = np.isfinite(dijkstra(self.drive_matrix(), indices=self.entry_vertices, min_only=True))
-        lost = self.facility_of_slot[counted[~reached[counted]]].tolist()
-        if lost:
-            reason = "cannot be reached from an entry"
-            raise GraphError([facility_problem(self.facilities[i], i, reason) for i in lost])
-
-    def _weights(self, name: str, count: int) -> dict[str, FloatArray]:
-        weights = {}
-        for purpose, given in getattr(self, name).items():
-            what = f"lot {self.name!r}: {name}[{purpose!r:.40}]"
-            weights[purpose] = values = _frozen(given, what)
-            if values.shape != (count,):
-                raise InputError(f"{what} has shape {values.shape}, want ({count},)")
-            for value in values.tolist():
-                require_number(what, value, least=0.0)
-        return weights
-
-    def _set_zones(self) -> None:
-        n = len(self.slot_ids)
-        zone = np.array(self.slot_zone if np.size(self.slot_zone) else [""] * n, dtype=np.str_)
-        if zone.shape != (n,):
-            raise InputError(f"lot {self.name!r}: slot_zone has shape {zone.shape}, want ({n},)")
-        if self.facilities:
-            # One more for the index -1.
-            inherited = np.array([*(facility.zone for facility in self.facilities), ""])
-            zone = np.where(zone == "", inherited[self.facility_of_slot], zone)
-        zone.flags.writeable = False
-        self._set("slot_zone", zone)
-        self._set("zones", tuple(sorted({name or NO_ZONE for name in zone.tolist()})))
-        order = {name: i for i, name in enumerate(self.zones)}
-        zone_of_slot = np.array([order[name or NO_ZONE] for name in zone.tolist()], np.int64)
-        zone_of_slot.flags.writeable = False
-        self._set("zone_of_slot", zone_of_slot)
+    def _set_rules(self, zone_rules: Mapping[str, Zone]) -> None:
         for name in self.zones:
-            if not is_plain(name):
-                raise InputError(f"lot {self.name!r}: zone {name!a:.60} has control characters")
-            if self.zone_rules and name != NO_ZONE and name not in self.zone_rules:
-                raise InputError(
-                    f"lot {self.name!r} has no rules of zone {name!r:.40}; {nearest(name, self.zone_rules)}"
-                )
-        self._set("zone_rules", dict(self.zone_rules))
-        for name, rules in self.zone_rules.items():
-            if name != rules.name:
-                raise InputError(f"lot {self.name!r}: zone_rules[{name!r:.40}] is of zone {rules.name!r:.40}")
-        users = {user for rules in self.zone_rules.values() for user in rules.users}
+            if zone_rules and name != NO_ZONE and name not in zone_rules:
+                raise InputError(f"no rules of zone {name!r:.40}; {nearest(name, zone_rules)}")
+        for name, rules in zone_rules.items():
+            require(name == rules.name, f"zone_rules[{name!r:.40}] is of zone {rules.name!r:.40}")
+        users = {user for rules in zone_rules.values() for user in rules.users}
+        self._set("zone_rules", dict(zone_rules))
         self._set("classes", (PUBLIC, *sorted(users - {PUBLIC})))
 
     def with_rules(self, zone_rules: Mapping[str, Zone]) -> ParkingLot:
@@ -390,18 +296,9 @@ class ParkingLot(_ByValue):
             InputError: see the class.
         """
         lot = copy.copy(self)
-        lot._set("zone_rules", zone_rules)
-        lot._set_zones()
+        with naming(f"lot {self.name!r}"):
+            lot._set_rules(zone_rules)
         return lot
-
-    def _require_names(self) -> None:
-        if len(self.slot_ids) == 0:
-            raise InputError(f"lot {self.name!r} has no slot")
-        for name in (self.name, *self.slot_ids):
-            if not is_plain(name):
-                raise InputError(f"lot: name {name!a:.60} has control characters")
-        if repeated := [name for name, count in Counter(self.slot_ids).items() if count > 1]:
-            raise InputError(f"lot {self.name!r}: slot id {repeated[0]!r} appears twice")
 
     def __repr__(self) -> str:
         return f"ParkingLot({self.name!r}, {self.n_slots} slots, {self.n_vertices} vertices)"
@@ -488,20 +385,60 @@ class ParkingLot(_ByValue):
         return csr_array((length[first], (source[first], target[first])), shape=shape)
 
 
+def _add_counted(lot: ParkingLot) -> None:
+    """Append the slots of counted facilities that are missing, and place all of them beside their lanes."""
+    counted = [facility for facility in lot.facilities if facility.is_counted]
+    if not counted:
+        return
+    names, n = tuple(facility.name for facility in counted), len(lot.slot_ids)
+    there = lot.slot_ids[max(n - len(names), 0) :] == names
+    drawn = n - len(names) if there else n
+    xy, yaw = (
+        nominal_slots(lot.facilities, [lane.points for lane in lot.lanes])
+        if lot.lanes
+        else (np.zeros((len(counted), 2)), np.zeros(len(counted)))
+    )
+    lot._set("slot_ids", lot.slot_ids[:drawn] + names)
+    for name, values in (
+        ("slot_xy", xy),
+        ("slot_yaw", yaw),
+        ("slot_length", np.full(len(names), NOMINAL_SLOT[0])),
+        ("slot_width", np.full(len(names), NOMINAL_SLOT[1])),
+        ("slot_mouth", np.full(len(names), Mouth.REAR)),
+        ("slot_parking_cost_s", np.zeros(len(names))),
+        ("slot_zone", np.array([facility.zone for facility in counted], np.str_)),
+        ("slot_facility", np.array(names, np.str_)),
+    ):
+        column = np.asarray(getattr(lot, name))
+        if column.size == 0 and drawn:
+            column = np.zeros(drawn, values.dtype)
+        require(len(column) in (drawn, n), f"lot {lot.name!r}: {name} has {len(column)} values, want {n}")
+        lot._set(name, np.concatenate([column[:drawn].reshape(-1, *values.shape[1:]), values]))
+
+
+def _require_reachable(lot: ParkingLot) -> None:
+    counted = np.flatnonzero(lot.is_counted)
+    if not len(counted):
+        return
+    from scipy.sparse.csgraph import dijkstra
+
+    reached = np.isfinite(dijkstra(lot.drive_matrix(), indices=lot.entry_vertices, min_only=True))
+    lost = lot.facility_of_slot[counted[~reached[counted]]].tolist()
+    if lost:
+        reason = "cannot be reached from an entry"
+        raise GraphError([facility_problem(lot.facilities[i], i, reason) for i in lost])
+
+
 def mouth_heading(yaw: FloatArray, mouth: NDArray[np.int8]) -> FloatArray:
-    """Direction that the mouth of each slot faces, (n,) float64, rad."""
-    heading: FloatArray = yaw + np.array([np.pi, np.pi / 2, -np.pi / 2])[mouth]
-    return heading
+    return yaw + np.array([np.pi, np.pi / 2, -np.pi / 2])[mouth]  # type: ignore[no-any-return]
 
 
 def mouth_points(
     xy: FloatArray, yaw: FloatArray, length: FloatArray, width: FloatArray, mouth: NDArray[np.int8]
 ) -> FloatArray:
-    """Middle of the side by which each slot is entered, (n, 2) float64, m."""
     half = np.where(mouth == Mouth.REAR, length, width) / 2
     heading = mouth_heading(yaw, mouth)
-    middle: FloatArray = xy + half[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    return middle
+    return xy + half[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)  # type: ignore[no-any-return]
 
 
 def corner_points(xy: FloatArray, yaw: FloatArray, length: FloatArray, width: FloatArray) -> FloatArray:
@@ -513,25 +450,7 @@ def corner_points(xy: FloatArray, yaw: FloatArray, length: FloatArray, width: Fl
 
 
 def is_building(wall: FloatArray) -> bool:
-    """Whether a wall, (k, 2) m, is a closed line, i.e. the outline of a building."""
     return len(wall) >= 4 and np.array_equal(wall[0], wall[-1])
-
-
-def _frozen(values: ArrayLike, name: str) -> FloatArray:
-    try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {values!r:.60}, want numbers") from error
-    array.flags.writeable = False
-    return array
-
-
-def _require_finite(what: str, values: FloatArray) -> None:
-    wrong = ~(np.abs(values) <= FARTHEST)
-    if wrong.any():
-        where = tuple(np.argwhere(wrong)[0])
-        index = ", ".join(map(str, where))
-        raise InputError(f"{what}[{index}] is {values[where]}, want a finite number, at most {FARTHEST:.0e}")
 
 
 def _same(a: object, b: object) -> bool:

@@ -41,13 +41,10 @@ def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
 
 
 def _content(lot: ParkingLot, seed: int) -> bytes:
-    digest = hashlib.sha256(str(seed).encode())
     columns = (lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width, lot.slot_mouth)
-    for array in (*columns, *lot.walls, *(lane.points for lane in lot.lanes)):
-        values = np.ascontiguousarray(array)
-        digest.update(f"{values.shape}{values.dtype}".encode())
-        digest.update(values.tobytes())
-    return digest.digest()
+    arrays = map(np.asarray, (*columns, *lot.walls, *(lane.points for lane in lot.lanes)))
+    parts = (f"{array.shape}{array.dtype}".encode() + array.tobytes() for array in arrays)
+    return hashlib.sha256(str(seed).encode() + b"".join(parts)).digest()
 
 
 def _make_slot_lot(lot: ParkingLot, seed: int) -> SlotLot:
@@ -86,7 +83,6 @@ class LotScenes:
         self._scene: Scene | None = None
 
     def at(self, time: float, ego: FloatArray | None = None) -> Scene:
-        """Return the scene at a time, s, without the car with the sensors, which is at `ego`, (3,) x, y, yaw."""
         taken = self._world.occupied(self._everything, time)
         sojourn = self._world.sojourn(self._everything, time)
         if self._scene is None:

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.errors import InputError, nearest, require_keywords, require_whole
+from parkenv.errors import InputError, nearest, require, require_keywords, require_whole
 from parkenv.files.field_types import NotNegative, Positive, Validated
 from parkenv.world.demand import Demand, TownDemand
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
@@ -300,7 +300,6 @@ class SearchProblem(Validated):
         return _read_only(metres / self.v_drive)
 
     def _counted(self, known: str) -> NDArray[np.int64]:
-        """Return the slots of counted facilities of which drivers know so much."""
         facilities = [facility for facility in self.lot.facilities if facility.is_counted]
         there = np.flatnonzero([facility.known == known for facility in facilities])
         return self.lot.n_slots - len(facilities) + there
@@ -397,10 +396,11 @@ class Scenario(SearchProblem):
             require_whole("entry", self.entry, most=len(self.lot.entries) - 1)
         for name in ("occupancy", "prior"):
             model = getattr(self, name)
-            if model is not None and model.n_slots != self.lot.n_slots:
-                raise InputError(
-                    f"{name} is for {model.n_slots} slots, lot {self.lot.name!r} has {self.lot.n_slots}"
-                )
+            n_slots = self.lot.n_slots if model is None else model.n_slots
+            require(
+                n_slots == self.lot.n_slots,
+                f"{name} is for {n_slots} slots, lot {self.lot.name!r} has {self.lot.n_slots}",
+            )
 
     def public(self) -> SearchProblem:
         """Return the part that agents may know: without the occupancy, its forecast model and the traffic."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, require_one_of
+from parkenv.errors import InputError, require, require_one_of
 from parkenv.files.field_types import Flag, NotNegative, Probability, Validated
 from parkenv.files.limited_reading import JsonFormat
 
@@ -21,8 +21,6 @@ _FORMAT = JsonFormat("parkenv-sensor-model", 1, "a sensor model")
 
 
 class SensorRates(NamedTuple):
-    """Sensor rates for k slots."""
-
     seen: FloatArray  # (k,) float64, P(a slot in view is observed)
     hit: FloatArray  # (k,) float64, P(observed taken | taken, observed)
     false_alarm: FloatArray  # (k,) float64, P(observed taken | free, observed)
@@ -140,8 +138,8 @@ class SensorModel(Validated):
 
 
 def _require_informative(hit_rate: float, false_alarm_rate: float) -> None:
-    if hit_rate <= false_alarm_rate:
-        raise InputError(
-            f"hit_rate {hit_rate} is not above false_alarm_rate {false_alarm_rate}: "
-            "observations would carry no information"
-        )
+    require(
+        hit_rate > false_alarm_rate,
+        f"hit_rate {hit_rate} is not above false_alarm_rate {false_alarm_rate}: "
+        "observations would carry no information",
+    )

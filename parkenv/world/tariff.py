@@ -9,14 +9,15 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import AfterValidator, Field, InstanceOf
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.errors import InputError, naming, nearest, require_number
-from parkenv.files.file_names import is_plain
+from parkenv.errors import InputError, naming, nearest, require, require_number
+from parkenv.files.field_types import Name, NotNegative, Positive, Validated
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_S
 
 NO_ZONE = "other"
@@ -45,15 +46,13 @@ _SPAN = re.compile(r"(\d?\d):(\d\d)-(\d?\d):(\d\d)")
 class Hours:
     """Hours of the week.
 
-    Args:
-        days: for each day from Monday on, pairs of begin and end, minutes since midnight.
-
     Examples:
         >>> hours = Hours.parse("Mo-Fr 08:00-18:00; Sa 09:00-13:00")
         >>> float(hours.within(0.0, 2 * 86400.0)) / 3600
         20.0
     """
 
+    # for each day from Monday on, pairs of begin and end, minutes since midnight
     days: tuple[tuple[tuple[int, int], ...], ...]
 
     @classmethod
@@ -67,12 +66,10 @@ class Hours:
             text: the hours.
             field: what messages call them.
         """
-        if not isinstance(text, str):
-            raise InputError(f"{field} is {text!r:.40}, want a text such as 'Mo-Sa 08:00-20:00'")
         days: list[tuple[tuple[int, int], ...]] = [()] * 7
-        for rule in text.replace("24/7", "00:00-24:00").split(";"):
+        for rule in str(text).replace("24/7", "00:00-24:00").split(";"):
             match = _RULE.fullmatch(rule.strip())
-            if match is None:
+            if match is None or not isinstance(text, str):
                 raise InputError(f"{field} is {text!r:.40}, want hours such as 'Mo-Sa 08:00-20:00'")
             spans = () if match["times"] == "off" else _spans(match["times"], field)
             for day in _days(match["days"] or "Mo-Su", field):
@@ -87,14 +84,12 @@ class Hours:
         rules = []
         for spans, names in by_spans.items():
             times = ",".join(f"{a // 60:02}:{a % 60:02}-{b // 60:02}:{b % 60:02}" for a, b in spans) or "off"
-            whole = DAYS[DAYS.index(names[0]) :][: len(names)]
-            run = len(names) > 2 and list(whole) == names
+            run = len(names) > 2 and list(DAYS[DAYS.index(names[0]) :][: len(names)]) == names
             rules.append(f"{f'{names[0]}-{names[-1]}' if run else ','.join(names)} {times}")
         return "; ".join(rules)
 
     @cached_property
     def _week(self) -> tuple[FloatArray, FloatArray]:
-        """Times of the week, s, and the seconds of these hours before each; linear between."""
         spans = [(DAY_S * d + 60.0 * a, DAY_S * d + 60.0 * b) for d in range(7) for a, b in self.days[d]]
         edges = np.array([0.0, *(t for span in spans for t in span), WEEK_S])
         open_s = np.diff(edges)
@@ -121,13 +116,11 @@ class Hours:
 
 
 def _days(text: str, field: str) -> list[int]:
-    """Return the days of a text such as `Mo-Fr,Su`; a range may run across Sunday."""
     days = []
     for part in text.split(","):
         names = part.split("-")
         for name in names:
-            if name not in DAYS:
-                raise InputError(f"{field} has the day {name!r}, want one of {', '.join(DAYS)}")
+            require(name in DAYS, f"{field} has the day {name!r}, want one of {', '.join(DAYS)}")
         first, last = DAYS.index(names[0]), DAYS.index(names[-1])
         days += [(first + k) % 7 for k in range((last - first) % 7 + 1)]
     return days
@@ -139,11 +132,10 @@ def _spans(text: str, field: str) -> tuple[tuple[int, int], ...]:
         match = _SPAN.fullmatch(part.strip())
         h, m, end_h, end_m = map(int, match.groups()) if match else (0, 60, 0, 60)
         begin, end = 60 * h + m, 60 * end_h + end_m
-        if max(m, end_m) > 59 or max(begin, end) > 24 * 60:
-            raise InputError(f"{field} has {part!r:.40}, want a span such as 08:00-20:00")
-        if end <= begin:
+        if max(m, end_m) > 59 or max(begin, end) > 24 * 60 or end <= begin:
             raise InputError(
-                f"{field} has {part!r}, want an end after the begin: across midnight, write two spans"
+                f"{field} has {part!r:.40}, want an end after the begin, such as 08:00-20:00; write two spans across "
+                "midnight"
             )
         spans.append((begin, end))
     spans.sort()
@@ -153,20 +145,16 @@ def _spans(text: str, field: str) -> tuple[tuple[int, int], ...]:
     return tuple(spans)
 
 
-@dataclass(frozen=True)
-class Price:
-    """What a stay costs, in any currency.
+def _rising(steps: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    for (stay_s, price), (before_s, least) in zip(steps, ((0.0, 0.0), *steps), strict=False):
+        if stay_s <= before_s or price < least:
+            raise ValueError("pairs of a stay in seconds and a price; stays rise, and prices must not fall")
+    return steps
 
-    Args:
-        per_hour: price of an hour; with steps, of each hour beyond the last one.
-        steps: pairs of a stay, s, and the price of stays up to it, both increasing: a ticket machine's table.
-        free_s: s, first charged seconds of a stay that cost nothing.
-        daily_cap: the most that 24 hours from the begin of the stay cost; with it, each 24 hours are a stay of their
-            own.
-        charged: hours when parking is charged; only they count as stay. None: always.
-        per_kwh: price of each kWh charged into the car, on top.
-        hourly: pairs of hours, which do not overlap, and the price of an hour then, instead of `per_hour`, `steps`,
-            `free_s` and `charged`; other hours are free.
+
+@dataclass(frozen=True)
+class Price(Validated):
+    """What a stay costs, in any currency.
 
     Examples:
         >>> price = Price(steps=((3600.0, 1.0), (7200.0, 3.0)), per_hour=2.0, daily_cap=8.0)
@@ -174,39 +162,26 @@ class Price:
         [1.0, 3.0, 5.0, 8.0]
     """
 
-    per_hour: float = 0.0
-    steps: tuple[tuple[float, float], ...] = ()
-    free_s: float = 0.0
-    daily_cap: float | None = None
-    charged: Hours | None = None
-    per_kwh: float = 0.0
-    hourly: tuple[tuple[Hours, float], ...] = ()
+    per_hour: NotNegative = 0.0  # price of an hour; with steps, of each hour beyond the last one
+    # pairs of a stay, s, and the price of stays up to it, both increasing: a ticket machine's table
+    steps: Annotated[tuple[tuple[NotNegative, NotNegative], ...], AfterValidator(_rising)] = ()
+    free_s: NotNegative = 0.0  # s, first charged seconds of a stay that cost nothing
+    # the most that 24 hours from the begin of the stay cost; with it, each 24 hours are a stay of their own
+    daily_cap: NotNegative | None = None
+    charged: Hours | None = None  # hours when parking is charged; only they count as stay. None: always.
+    per_kwh: NotNegative = 0.0  # price of each kWh charged into the car, on top
+    # pairs of hours, which do not overlap, and the price of an hour then, instead of `per_hour`, `steps`, `free_s`
+    # and `charged`; other hours are free
+    hourly: tuple[tuple[InstanceOf[Hours], NotNegative], ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("per_hour", "free_s", "per_kwh"):
-            require_number(name, getattr(self, name), least=0.0)
+        super().__post_init__()
         if self.hourly and (self.per_hour or self.steps or self.free_s or self.charged):
             raise InputError("hourly is given, want neither per_hour, steps, free_s nor charged beside it")
-        for _, amount in self.hourly:
-            require_number("hourly", amount, least=0.0)
         for day, name in enumerate(DAYS):
             spans = sorted(span for hours, _ in self.hourly for span in hours.days[day])
             if any(end > begin for (_, end), (begin, _) in pairwise(spans)):
                 raise InputError(f"hourly has two prices at a time on {name}, want hours that do not overlap")
-        if self.daily_cap is not None:
-            require_number("daily_cap", self.daily_cap, least=0.0)
-        object.__setattr__(self, "steps", tuple(map(tuple, self.steps)))
-        least_s = least = 0.0
-        for k, step in enumerate(self.steps):
-            if len(step) != 2:
-                raise InputError(f"steps[{k}] is {step!r:.40}, want a stay in seconds and a price")
-            require_number(f"steps[{k}]: stay", step[0], above=least_s)
-            require_number(f"steps[{k}]: price", step[1], least=0.0)
-            if step[1] < least:
-                raise InputError(
-                    f"steps[{k}] has the price {step[1]:g}, want at least {least:g}: prices must not fall"
-                )
-            least_s, least = step
 
     @classmethod
     def parse(cls, given: Any, field: str = "price") -> Price:
@@ -232,9 +207,6 @@ class Price:
                 )
             )
         members = members_of(given, [f.name for f in fields(cls)], field)
-        steps = members.get("steps", [])
-        if not isinstance(steps, list) or not all(isinstance(step, list) for step in steps):
-            raise InputError(f"steps is {steps!r:.40}, want a list of pairs: stay in seconds and price")
         if "charged" in members:
             members["charged"] = Hours.parse(members["charged"], "charged")
         if "hourly" in members:
@@ -242,7 +214,6 @@ class Price:
         return cls(**members)
 
     def members(self) -> dict[str, Any]:
-        """Return the members that `parse` reads, without those of a price that costs nothing."""
         members = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
         if self.charged is not None:
             members["charged"] = str(self.charged)
@@ -252,17 +223,14 @@ class Price:
 
     @property
     def rules(self) -> list[tuple[float, str]]:
-        """Prices of an hour, each with a rule of its hours, as `parse` reads them."""
         rules = ((price, rule) for hours, price in self.hourly for rule in str(hours).split("; "))
         return [(price, rule) for price, rule in rules if not rule.endswith(" off")]
 
     def __bool__(self) -> bool:
-        """Whether any stay costs anything."""
         amounts = (price for _, price in (*self.steps, *self.hourly))
         return any((self.per_hour, self.per_kwh, *amounts))
 
     def raised(self, per_hour: float) -> Price:
-        """Return the price with so much more an hour; a cap for a day stays."""
         if self.hourly:
             return replace(self, hourly=tuple((hours, price + per_hour) for hours, price in self.hourly))
         steps = tuple((stay_s, price + per_hour * stay_s / HOUR_S) for stay_s, price in self.steps)
@@ -289,13 +257,11 @@ class Price:
         return np.asarray(cost + self.per_kwh * np.asarray(kwh) if self.per_kwh else cost)
 
     def of_hours(self, seconds: Mapping[Hours, FloatArray]) -> FloatArray:
-        """Return what stays cost of which so many seconds fall into the hours of `hourly`, (...) each."""
         # A stay for ever is free where an hour is.
-        known = ((np.where(price, seconds[hours], 0.0), price) for hours, price in self.hourly)
-        return np.asarray(sum(its * (price / HOUR_S) for its, price in known))
+        stays = ((np.where(price, seconds[hours], 0.0), price) for hours, price in self.hourly)
+        return np.asarray(sum(stay * (price / HOUR_S) for stay, price in stays))
 
     def _of_days(self, begin: FloatArray, stay: FloatArray) -> FloatArray:
-        """Return what stays of at most a week cost where each 24 hours are capped."""
         cap = np.inf if self.daily_cap is None else self.daily_cap
         days = range(math.ceil(float(np.max(stay, initial=0.0)) / DAY_S))
         parts = [self._of(begin + DAY_S * k, np.clip(stay - DAY_S * k, 0.0, DAY_S)) for k in days]
@@ -316,34 +282,18 @@ class Price:
 
 
 @dataclass(frozen=True)
-class Zone:
-    """The rules of a zone: its price, and who may park there, when and for how long.
+class Zone(Validated):
+    """The rules of a zone: its price, and who may park there, when and for how long."""
 
-    Args:
-        name: its name.
-        price: what stays cost.
-        hours: when cars may be parked there; a stay must lie within. None: always.
-        max_stay_s: s, longest stay; where the price has charged hours, only these count.
-        users: classes of users, one of which a driver must belong to: `public` (everyone), or names such as
-            `permit-a`, `disabled`, `charging`, `customers`, `delivery`, `private`.
-    """
-
-    name: str
-    price: Price = field(default_factory=Price)
-    hours: Hours | None = None
-    max_stay_s: float | None = None
-    users: tuple[str, ...] = (PUBLIC,)
-
-    def __post_init__(self) -> None:
-        if self.max_stay_s is not None:
-            require_number("max_stay_s", self.max_stay_s, above=0.0)
-        users = tuple(self.users)
-        if not users or not all(isinstance(user, str) and user and is_plain(user) for user in users):
-            raise InputError(f"users is {users!a:.40}, want names of classes")
-        object.__setattr__(self, "users", users)
+    name: str  # its name
+    price: Price = field(default_factory=Price)  # what stays cost
+    hours: Hours | None = None  # when cars may be parked there; a stay must lie within. None: always.
+    max_stay_s: Positive | None = None  # s, longest stay; where the price has charged hours, only these count
+    # classes of users, one of which a driver must belong to: `public` (everyone), or names such as `permit-a`,
+    # `disabled`, `charging`, `customers`, `delivery`, `private`
+    users: Annotated[tuple[Annotated[Name, Field(min_length=1)], ...], Field(min_length=1)] = (PUBLIC,)
 
     def admits(self, begin_s: ArrayLike, stay_s: ArrayLike) -> BoolArray:
-        """Return whether the hours and the longest stay allow stays, (...) bool, whatever the class of the driver."""
         begin, stay = np.broadcast_arrays(np.asarray(begin_s, np.float64), np.asarray(stay_s, np.float64))
         allowed = np.ones(stay.shape, bool)
         if self.hours is not None:
@@ -357,15 +307,12 @@ class Zone:
 
 @dataclass(frozen=True)
 class Tariff:
-    """Prices per hour that replace those of a lot's zones, or are added to them.
+    """Prices per hour that replace those of a lot's zones, or are added to them."""
 
-    Args:
-        per_hour: price of an hour by zone, at least 0, in any currency; a text such as `+1` is added to what an hour of
-            the zone costs, with its hours and steps as they are; other texts are read by `Price.parse`. A name may have
-            `*` for any letters: that of all such zones that cost something. The first name of a zone counts; other
-            zones keep their prices.
-    """
-
+    # price of an hour by zone, at least 0, in any currency; a text such as `+1` is added to what an hour of the zone
+    # costs, with its hours and steps as they are; other texts are read by `Price.parse`. A name may have `*` for any
+    # letters: that of all such zones that cost something. The first name of a zone counts; other zones keep their
+    # prices.
     per_hour: Mapping[str, float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -375,14 +322,12 @@ class Tariff:
         object.__setattr__(self, "per_hour", MappingProxyType(dict(self.per_hour)))
 
     def __bool__(self) -> bool:
-        """Whether there are prices, be they 0."""
         return bool(self.per_hour)
 
     def __reduce__(self) -> tuple[type[Tariff], tuple[dict[str, float | str]]]:
         return Tariff, (dict(self.per_hour),)
 
     def priced(self, zone: Zone) -> Zone:
-        """Return the zone with the price that the tariff has for it, or as it is."""
         price = next((price for name, price in self.per_hour.items() if _means(name, zone)), None)
         if price is None:
             return zone
@@ -390,7 +335,6 @@ class Tariff:
         return replace(zone, price=zone.price.raised(given.per_hour) if is_added else given)
 
     def require_zones(self, zones: Sequence[Zone], lot: str) -> None:
-        """Check that a lot has every zone with a price."""
         for name in self.per_hour:
             if not any(_means(name, zone) for zone in zones):
                 near = nearest(name, [zone.name for zone in zones])
@@ -416,10 +360,8 @@ def charge_in(text: str) -> tuple[float, bool] | None:
 
 
 def _per_hour(text: str, field: str, whole: str) -> float:
-    """Return the price of an hour of a text such as `2`, `2/h` or `+1/h`."""
     try:
-        amount = float(text.strip().removesuffix("/h"))
-        require_number(field, amount, least=0.0)
+        require_number(field, amount := float(text.strip().removesuffix("/h")), least=0.0)
         return amount
     except ValueError:
         raise InputError(
@@ -429,7 +371,6 @@ def _per_hour(text: str, field: str, whole: str) -> float:
 
 
 def members_of(given: Any, known: Collection[str], what: str) -> dict[str, Any]:
-    """Return the members of a JSON object, all of which are known."""
     if not isinstance(given, dict):
         raise InputError(f"{what} is {given!r:.40}, want an object with some of {', '.join(known)}")
     for name in given:

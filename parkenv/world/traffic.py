@@ -78,11 +78,9 @@ class LotTraffic:
         if ego is None:
             return every
         clear = _clear_of(ego, every.vehicle_pose, _HALF_CAR)
-        free = _clear_of(ego, every.walker_pose, _HALF_PERSON)
-        return every.only(clear, free)
+        return every.only(clear, _clear_of(ego, every.walker_pose, _HALF_PERSON))
 
     def movers_at(self, times: FloatArray) -> Movers:
-        """Return all road users, each at its own time: (n,) s, cars first."""
         from sim_sensors.movers import LOOKS, Movers
 
         n, station = self._n_cars, self._loops.stations(times)
@@ -91,15 +89,12 @@ class LotTraffic:
         return Movers(poses[:n], self._models, poses[n:], stride, self._looks % LOOKS)
 
     def poses_at(self, times: FloatArray) -> FloatArray:
-        """Return poses, (n, 3) x, y, yaw, of all road users, cars first, each at its own time, s."""
         if self._n == 0:
             return np.empty((0, 3))
         return self._loops.poses(self._loops.stations(times))
 
 
 class _Loop(NamedTuple):
-    """Motion along a closed path at constant speed."""
-
     path: FloatArray  # (k, 2) m, corners; the last one connects to the first
     reach: float  # m; the heading is that of the chord from this far behind to this far ahead
     speed: float  # m/s
@@ -123,8 +118,7 @@ class _Loops:
         self._start = start * self._length
 
     def stations(self, times: FloatArray) -> FloatArray:
-        station: FloatArray = (self._start + self._speed * times) % self._length
-        return station
+        return (self._start + self._speed * times) % self._length  # type: ignore[no-any-return]
 
     def poses(self, station: FloatArray) -> FloatArray:
         """Poses, (n, 3) x, y in m and yaw in rad, at stations, (n,) m."""
@@ -142,12 +136,10 @@ class _Loops:
         i = np.minimum((self._station <= s[:, None]).sum(axis=1), self._last)
         start, end = self._corners[row, i - 1], self._corners[row, i]
         low, high = self._station[row, i - 1], self._station[row, i]
-        point: FloatArray = (end - start) / (high - low)[:, None] * (s - low)[:, None] + start
-        return point
+        return (end - start) / (high - low)[:, None] * (s - low)[:, None] + start  # type: ignore[no-any-return]
 
 
 def _measured(path: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of a closed path, the first one once more at the end, and their stations, m."""
     corners = np.concatenate([path, path[:1]])
     leg = np.hypot(*np.diff(corners, axis=0).T)
     if not leg.any():
@@ -156,21 +148,16 @@ def _measured(path: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _car(routes: _Routes, rng: np.random.Generator, slots: SlotLot) -> tuple[_Loop, int]:
-    path = routes.round_trip(rng)
-    loop = _Loop(path, _AXLE_M, rng.uniform(*CAR_SPEEDS), 0.0, rng.random())
-    slot = int(rng.integers(len(slots.fitting)))
-    return loop, int(rng.choice(slots.fitting[slot]))
+    loop = _Loop(routes.round_trip(rng), _AXLE_M, rng.uniform(*CAR_SPEEDS), 0.0, rng.random())
+    return loop, int(rng.choice(slots.fitting[int(rng.integers(len(slots.fitting)))]))
 
 
 def _person(routes: _Routes, rng: np.random.Generator) -> tuple[_Loop, int]:
-    path = routes.walk(rng)
-    loop = _Loop(path, 0.5, rng.uniform(*WALK_SPEEDS), rng.uniform(-0.4, 0.9), rng.random())
+    loop = _Loop(routes.walk(rng), 0.5, rng.uniform(*WALK_SPEEDS), rng.uniform(-0.4, 0.9), rng.random())
     return loop, int(rng.integers(1 << 30))
 
 
 class _Routes:
-    """Random routes over the drive graph of a lot."""
-
     def __init__(self, lot: ParkingLot, goal: int) -> None:
         self._lot = lot
         self._goal = lot.goals[goal]
@@ -179,14 +166,12 @@ class _Routes:
         self._drive = lot.drive_matrix()
 
     def round_trip(self, rng: np.random.Generator) -> FloatArray:
-        """Draw a drive past some slots and back to the first: corners, (k, 2) m."""
         stops = rng.choice(self._lot.n_slots, size=min(_STOPS, self._lot.n_slots), replace=False).tolist()
         legs = [self._shortest_path(a, b) for a, b in zip(stops, [*stops[1:], stops[0]], strict=True)]
         path = np.concatenate(legs)
         return path if len(path) else np.asarray(self._lot.vertex_xy[stops[:1]])
 
     def walk(self, rng: np.random.Generator) -> FloatArray:
-        """Draw a walk from a slot to the goal and back: corners, (k, 2) m."""
         slot = int(rng.integers(self._lot.n_slots))
         there = np.concatenate(
             [self._lot.mouth_xy()[[slot]], self._shortest_path(slot, self._goal_vertex), [self._goal]]
@@ -207,7 +192,6 @@ class _Routes:
 
 
 def _clear_of(ego: FloatArray, pose: FloatArray, half: FloatArray) -> NDArray[np.bool_]:
-    """Mask, (n,), of the rectangles that keep a distance of `_GAP` from the searching car."""
     offset = pose[:, :2] - ego[:2]
     c, s = np.cos(ego[2]), np.sin(ego[2])
     local = np.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]], axis=1)

@@ -112,11 +112,11 @@ class ExactSolution:
         InputError: more than `MOST_SLOTS` slots or `most_states` states, or a sensor that errs.
 
     Examples:
-        >>> from parkenv.lots import packaged_lot
-        >>> problem = SearchProblem(lot=packaged_lot("mini"), give_up_s=300.0)
+        >>> from parkenv.lots import grid_lot
+        >>> problem = SearchProblem(lot=grid_lot(1, 6), give_up_s=300.0)
         >>> entry = int(problem.lot.entry_vertices[0])
-        >>> ExactSolution(problem, np.zeros(10), entry).expected_s < ExactSolution(
-        ...     problem, np.full(10, 0.8), entry).expected_s
+        >>> ExactSolution(problem, np.zeros(6), entry).expected_s < ExactSolution(
+        ...     problem, np.full(6, 0.8), entry).expected_s
         True
     """
 

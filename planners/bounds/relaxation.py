@@ -31,8 +31,7 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError, require_whole
-from parkenv.world.occupancy.process import World
-from parkenv.world.occupancy.slot_law import SlotLaw
+from parkenv.world.occupancy.process import SlotLaw, World
 from parkenv.world.scenario import SearchProblem
 from planners.bounds.oracle import best_slot
 from planners.routes import DriveRoutes

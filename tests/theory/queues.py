@@ -13,7 +13,7 @@ from ordered_entry import ORDERED_ENTRY, by_distance
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import LEAVE, TAKE_SLOT, CompiledPolicy
 from parkenv.engine.records import LEFT, PARKED, car_at, fleet_at
-from parkenv.engine.shared_slots import is_shared_slot_taken
+from parkenv.engine.search_belief import is_shared_slot_taken
 from parkenv.lots.generators import grid_lot
 from parkenv.world.demand import (
     ConstantTime,

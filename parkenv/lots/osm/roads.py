@@ -19,9 +19,17 @@ from parkenv.lots.draft import LeftOut
 from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import OsmElement, OsmMap
-from parkenv.world.drive_graph import NODE_TOLERANCE, centrelines, component_labels, node_labels
+from parkenv.world.drive_graph import (
+    NODE_TOLERANCE,
+    Chains,
+    Rule,
+    centrelines,
+    component_labels,
+    connected,
+    node_labels,
+    rules_of,
+)
 from parkenv.world.lot import Lane, Turn
-from parkenv.world.turns import Chains, Rule, connected, rules_of
 
 STREET_WIDTH = {
     "motorway": 7.5,

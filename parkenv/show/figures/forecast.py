@@ -41,7 +41,7 @@ class ShownForecast(NamedTuple):
     draws: FloatArray  # (k, n) equally likely values of the n hours or half-hours
     forecast: FloatArray  # (n,)
     observed: FloatArray  # (n,)
-    reliability: FloatArray  # (3, b), see `parkenv.forecast.scores.reliability`
+    reliability: FloatArray  # (3, b), see `Scores.reliability`
     weight: str  # what reliability is weighted by
     by_forecast: list[Band]  # coverage by forecast fullness
     by_observed: list[Band]

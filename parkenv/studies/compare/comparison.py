@@ -240,7 +240,7 @@ class Comparison(CaseStudy):
     @cached_property
     def constant_forecasts(self) -> dict[str, tuple[Scenario, float]]:
         """Scenarios with the same forecast for every slot, and its probability, by name."""
-        from parkenv.world.occupancy.constant_map import ConstantForecast
+        from parkenv.world.occupancy.process import ConstantForecast
 
         made = {}
         for p_occupied in self.grid.constant_forecast:

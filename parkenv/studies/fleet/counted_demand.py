@@ -18,8 +18,7 @@ from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import compiled_policy_of
 from parkenv.studies.results import Row, without_nan
-from parkenv.world.arrivals import hours_between
-from parkenv.world.counted_demand import STAYS_H, follow_counts
+from parkenv.world.arrivals import STAYS_H, follow_counts, hours_between
 from parkenv.world.demand import weights_of_all
 from parkenv.world.scenario import drive_times
 from parkenv.world.week import DAY_HOURS, HOUR_S

@@ -66,7 +66,7 @@ class DemandStudy(Study):
     """Demand of a town that follows the counts of its car parks, and each later day as it was to be expected.
 
     The cars of a purpose have the goals, by the lot's weights, from which nearly all cars go to one car park, and its
-    counts tell when they come and how many are there at first (`parkenv.world.counted_demand`). Where they park is up
+    counts tell when they come and how many are there at first (`parkenv.world.arrivals`). Where they park is up
     to them; so the fleet is driven, and what a car park lacks or has too much is added to what the next round follows.
 
     Each day that is held out is driven for itself: its demand follows the forecast that was made before it

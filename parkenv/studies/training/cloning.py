@@ -97,7 +97,7 @@ class _DecisionRecorder(Observer):
         """Start a search."""
         del env
         self._decisions: list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]] = []
-        self._now = self._local.begin(observation)["local"]
+        self._now = self._local.observe(observation, begins=0)["local"]
 
     def on_step(self, step: Step) -> None:
         """Record the decision."""

@@ -28,7 +28,6 @@ def centred_logits(p: ArrayLike, deviation: ArrayLike) -> FloatArray:
 
 @compiled(error_model="numpy")
 def _centred_logit(p: float, deviation: float, factors: FloatArray) -> float:
-    """Return `centred_logits` of one probability; `factors` are exp(deviation·z) at the nodes."""
     wanted = math.log(p / (1.0 - p))
     if p <= 0.0 or p >= 1.0 or deviation == 0.0:
         return wanted

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import expit, logit
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.forecast.logistic_normal import NormalQuadrature
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
@@ -43,37 +43,28 @@ class CountedOccupancy(OccupancyModel):
     follows the counts: the occupancy counted in hour h is that at its end. Within these means, slots are two-state
     chains as in an `OccupancyProcess`, a process for each day. The forecast is made in the same way, from the curve
     that a forecasting model predicts for the day.
-
-    Args:
-        days: (d,) ISO dates, ascending, of the days that can be replayed.
-        occupied: (d, 24) float64, fraction of the places that was taken in each hour of these days; NaN if unknown.
-        level: (d, 24) float64, logit, predicted mean of that fraction's logit.
-        level_sd: (d, 24) float64, logits, standard deviation of the prediction's error.
-        attraction: (n,) float64, logit, popularity of the lot's slots.
-        mean_stay_s: s, mean parking duration; shorter in hours in which the lot empties faster.
-        source: name of the counts in messages.
     """
 
     kind: ClassVar[int] = PROCESS_KIND
     recorded: ClassVar[bool] = True
-    days: tuple[str, ...]
+    days: tuple[str, ...]  # (d,) ISO dates, ascending, of the days that can be replayed
+    # (d, 24) float64, fraction of the places that was taken in each hour of these days; NaN if unknown
     occupied: FloatArray
-    level: FloatArray
-    level_sd: FloatArray
-    attraction: FloatArray
+    level: FloatArray  # (d, 24) float64, logit, predicted mean of that fraction's logit
+    level_sd: FloatArray  # (d, 24) float64, logits, standard deviation of the prediction's error
+    attraction: FloatArray  # (n,) float64, logit, popularity of the lot's slots
+    # s, mean parking duration; shorter in hours in which the lot empties faster
     mean_stay_s: float = 2 * HOUR_S
-    source: str = "counts"
+    source: str = "counts"  # name of the counts in messages
     _worlds: dict[str, OccupancyProcess] = field(init=False, repr=False, default_factory=dict)
     _forecasts: dict[str, OccupancyProcess] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         shape = (len(self.days), DAY_HOURS)
-        if not self.days:
-            raise InputError(f"{self.source}: no days to replay, want at least one")
+        require(self.days, f"{self.source}: no days to replay, want at least one")
         for name in ("occupied", "level", "level_sd"):
             array = np.asarray(getattr(self, name), float)
-            if array.shape != shape:
-                raise InputError(f"{self.source}: {name} has shape {array.shape}, want {shape}")
+            require(array.shape == shape, f"{self.source}: {name} has shape {array.shape}, want {shape}")
             object.__setattr__(self, name, array)
         object.__setattr__(self, "attraction", np.asarray(self.attraction, float))
 
@@ -98,7 +89,9 @@ class CountedOccupancy(OccupancyModel):
 
     def process_of(self, day: str) -> OccupancyProcess:
         if day not in self._worlds:
-            curve = _without_gaps(self.occupied[self._index(day)])
+            curve = self.occupied[self._index(day)]
+            known = np.flatnonzero(np.isfinite(curve))
+            curve = np.interp(np.arange(DAY_HOURS), known, curve[known])
             self._worlds[day] = process_of_curve(self.attraction, curve, self.mean_stay_s)
         return self._worlds[day]
 
@@ -112,24 +105,17 @@ class CountedOccupancy(OccupancyModel):
         )
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """Return the forecast: the mean over the days that are possible, and by how much their level differs."""
         index, day = self._index(arrival.day), arrival.day
         if day not in self._forecasts:
             curve, _ = _QUADRATURE.expit(self.level[index], self.level_sd[index])
             self._forecasts[day] = process_of_curve(self.attraction, curve, self.mean_stay_s)
-        process = self._forecasts[day]
-        own = process.forecast(arrival)
+        own = self._forecasts[day].forecast(arrival)
         hour = int(arrival.time % DAY_S // HOUR_S)
         p = np.clip(own.p_occupied, MIN_PROBABILITY, MAX_PROBABILITY)
-        error = self._shift_of_slots(self.level[index, hour], self.level_sd[index, hour])
-        return Forecast(p, own.decay_rate, DayError(level=error))
-
-    def _shift_of_slots(self, level: float, level_sd: float) -> float:
-        """Return the shift of every slot's log-odds, logits, that shifts the lot's mean by `level_sd` logits."""
-        low, high = (
-            level_of_mean(self.attraction, float(expit(level + sign * level_sd))) for sign in (-1.0, 1.0)
-        )
-        return 0.5 * (high - low)
+        # The shift of every slot's log-odds, logits, that shifts the lot's mean by `level_sd` logits.
+        level, level_sd = self.level[index, hour], self.level_sd[index, hour]
+        low, high = (level_of_mean(self.attraction, float(expit(level + s * level_sd))) for s in (-1.0, 1.0))
+        return Forecast(p, own.decay_rate, DayError(level=0.5 * (high - low)))
 
     def _index(self, day: str) -> int:
         try:
@@ -176,8 +162,3 @@ def process_of_curve(attraction: FloatArray, curve: FloatArray, mean_stay_s: flo
     return OccupancyProcess(
         pull, np.tile(np.exp(arrivals), 7), np.ones(pull.size), np.tile(np.exp(departures), 7)
     )
-
-
-def _without_gaps(curve: FloatArray) -> FloatArray:
-    known = np.flatnonzero(np.isfinite(curve))
-    return np.interp(np.arange(DAY_HOURS), known, curve[known])

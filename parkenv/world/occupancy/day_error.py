@@ -24,17 +24,13 @@ Deviation = Annotated[NotNegative, Field(le=MAX_LOGITS)]
 
 @dataclass(frozen=True)
 class DayError(Validated):
-    """Standard deviations over days of a forecast's error, logits.
-
-    Args:
-        level: of the shift of all slots at once.
-        slope: of the additional rise from the middle of the lot to the goal, with a fall of the same size to the far
-            end; see `nearness`.
-    """
+    """Standard deviations over days of a forecast's error, logits."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", strict=False)  # as a table of a scenario file
 
-    level: Deviation = 0.0
+    level: Deviation = 0.0  # of the shift of all slots at once
+    # of the additional rise from the middle of the lot to the goal, with a fall of the same size to the far end; see
+    # `nearness`
     slope: Deviation = 0.0
 
     def __bool__(self) -> bool:

@@ -27,7 +27,6 @@ from parkenv.compiled.memory import ADDRESS, call_world_at, float64s, int64s, pr
 from parkenv.world.occupancy.centred_logits import TABLE_ROWS, TABLE_STEPS
 from parkenv.world.occupancy.decay import decay_factor
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, HOUR_S, PERIOD_S, WEEK_HOURS, WEEK_S
-from parkenv.world.week_hours import hour_of_week
 
 # Forecasts are never certain, so that a planner can recover from a wrong one.
 MIN_PROBABILITY = 0.001
@@ -109,6 +108,15 @@ recorded_day_at, cursor_at = record_at(RECORDED_DAY), record_at(CURSOR)
 functions_at = record_at(FUNCTIONS)
 
 
+@compiled(error_model="numpy")
+def hour_of_week(time: float) -> tuple[float, int, float]:
+    """Return week, hour of the week and second of the hour of a time, s since Monday 00:00."""
+    week = np.floor(time / WEEK_S)
+    second = time - week * WEEK_S
+    hour = min(int(second // HOUR_S), WEEK_HOURS - 1)
+    return week, hour, second - hour * HOUR_S
+
+
 @kernel
 def draw_arrival(key: np.uint64, n_days: int, start_s: float, end_s: float) -> tuple[int, float]:
     """Draw when the search with a key begins, uniform: the index of the day, and the second of the day in a window."""
@@ -118,7 +126,6 @@ def draw_arrival(key: np.uint64, n_days: int, start_s: float, end_s: float) -> t
 
 @inlined
 def begin_day(kind: int, model: int, world: Any) -> None:
-    """Draw what is special about the day of a world whose model has the record at an address; 0: there is none yet."""
     world.day_odds, world.day_slope = 1.0, 0.0
     if kind == PROCESS_KIND and model != 0:
         draw_day(process_at(model, 0), world)
@@ -142,7 +149,6 @@ def find_state(kind: int, model: int, world: Any, slot: int, cursor: Any, time: 
 
 @inlined
 def find_end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, time: float) -> float:
-    """Return when the car that stands in a slot at a time leaves, s; infinite if never. `find_state` found it there."""
     if kind == EXTERNAL_KIND:
         functions = functions_at(model, 0)
         return float(call_world_at(functions.next_free, functions.data, slot, time))
@@ -173,7 +179,6 @@ def has_days(process: Any) -> bool:
 
 @inlined
 def _odds_of_day(process: Any, world: Any, slot: int) -> float:
-    """Return the factor exp(L + S·nearness) of a slot's odds on the world's day."""
     if process.day_error[1] > 0.0:
         return float(world.day_odds * math.exp(world.day_slope * float64s(process.nearness)[slot]))
     return float(world.day_odds)
@@ -207,7 +212,6 @@ def _between(table: int, place: float) -> float:
 
 @kernel
 def process_state(process: Any, world: Any, slot: int, cursor: Any, time: float) -> bool:
-    """Return whether a slot of a process is taken, and move its cursor to the sojourn that holds `time`, s."""
     if cursor.sojourn == 0:
         _enter_first_sojourn(process, world, slot, cursor)
     while time >= cursor.valid_until:
@@ -222,7 +226,6 @@ def process_state(process: Any, world: Any, slot: int, cursor: Any, time: float)
 
 @kernel
 def _enter_first_sojourn(process: Any, world: Any, slot: int, cursor: Any) -> None:
-    """Draw the state at the arrival from the marginal on the day, and bound its end from below."""
     key, arrival, hour, second = world.key, world.arrival, world.hour, world.second_of_hour
     p, _ = process_forecast(process, hour, second, slot)
     odds = 1.0
@@ -246,7 +249,6 @@ def _enter_first_sojourn(process: Any, world: Any, slot: int, cursor: Any) -> No
 
 @kernel
 def find_sojourn_end(process: Any, world: Any, slot: int, cursor: Any) -> None:
-    """Compute the exact end of the cursor's sojourn, unless it is known."""
     if cursor.end_known:
         return
     state = 1 if cursor.occupied else 0
@@ -279,8 +281,7 @@ def _time_after(profile: int, hazards: int, since: float, hazard: float) -> floa
     # sums[hour] < rest <= sums[hour + 1], hence a positive rate, except for rounding at the ends.
     hour = min(max(_count_below(hazards, 0, WEEK_HOURS + 1, rest, False) - 1, 0), WEEK_HOURS - 1)
     second = min((rest - sums[hour]) / rates[hour], HOUR_S) if rates[hour] > 0.0 else 0.0
-    end: float = max((week + more_weeks) * WEEK_S + hour * HOUR_S + second, since)
-    return end
+    return max((week + more_weeks) * WEEK_S + hour * HOUR_S + second, since)  # type: ignore[no-any-return]
 
 
 @kernel
@@ -359,7 +360,6 @@ def process_law(process: Any, world: Any, slot: int) -> tuple[float, float, floa
 
 @inlined
 def prefetch_forecast(address: int, hour: int, slot: int) -> None:
-    """Load what `process_forecast` will read, without waiting for it; `address` is that of the PROCESS record."""
     process = process_at(address, 0)
     prefetch(process.factors + 8 * slot)
     prefetch(process.factors + 8 * (process.n_slots + slot))
@@ -381,7 +381,6 @@ def process_forecast(process: Any, hour: int, second: float, slot: int) -> tuple
 
 @inlined
 def _marginal_at_full_hour(process: Any, hour: int, slot: int) -> float:
-    """Return P(taken) of a slot at the beginning of an hour of the week."""
     start = float64s(process.hourly_marginals)[hour * process.n_slots + slot]
     if start == 0.0:
         start = _marginal_at_hour(process, hour, slot)
@@ -426,7 +425,6 @@ def _marginal_at_hour(process: Any, now: int, slot: int) -> float:
 
 @kernel
 def keep_hourly_marginals(process: Any, hour: int) -> None:
-    """Compute P(taken) of all slots at the beginning of an hour of the week, unless already stored."""
     n = process.n_slots
     start = float64s(process.hourly_marginals)
     missing = 0
@@ -440,7 +438,6 @@ def keep_hourly_marginals(process: Any, hour: int) -> None:
 
 @inlined
 def recorded_index(day: Any, slot: int, second: float) -> int:
-    """Return the index of the log's observation that defines a slot's state at a second of a recorded day."""
     record = int64s(day.record)[slot]
     begin, end = int64s(day.first)[record], int64s(day.first)[record + 1]
     return int(begin + _count_below(day.from_s, begin, end, second, True) - 1)
@@ -448,7 +445,6 @@ def recorded_index(day: Any, slot: int, second: float) -> int:
 
 @kernel
 def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
-    """Return whether a slot of a recorded day is taken at a time, and move its cursor; sojourns are not counted."""
     k = recorded_index(day, slot, time - day.midnight)
     record = int64s(day.record)[slot]
     last = k + 1 >= int64s(day.first)[record + 1]
@@ -459,7 +455,6 @@ def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
 
 @kernel
 def recorded_changes(day: Any, slot: int, second: float) -> int:
-    """Return how often a slot's state has changed from its first observation of a recorded day to a second of it."""
     taken, changes = uint8s(day.occupied), 0
     for k in range(int64s(day.first)[int64s(day.record)[slot]] + 1, recorded_index(day, slot, second) + 1):
         changes += taken[k] != taken[k - 1]
@@ -477,7 +472,6 @@ def _between_periods(values: int, second: float) -> float:
 
 @kernel
 def recorded_forecast(day: Any, slot: int, second: float) -> tuple[float, float]:
-    """Return P(taken) of a slot at a second of a recorded day, and its decay rate there, 1/s."""
     logit = _between_periods(day.log_odds + slot * DAY_PERIODS * 8, second)
     p = 1.0 / (1.0 + math.exp(-logit))
     rate = float64s(day.decay_rate)[min(int(second // HOUR_S), DAY_HOURS - 1)]
@@ -486,5 +480,4 @@ def recorded_forecast(day: Any, slot: int, second: float) -> tuple[float, float]
 
 @kernel
 def recorded_day_level(day: Any, second: float) -> float:
-    """Return the standard deviation of the error of a recorded day's level at a second of it, logits."""
     return float(_between_periods(day.day_level, second))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError, require_number, require_one_of
+from parkenv.errors import InputError, require, require_number, require_one_of
 from parkenv.files.limited_reading import csv_rows
 from parkenv.forecast.slot_days import Days, SlotDays
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, PERIOD_S
@@ -37,7 +37,6 @@ _KNOWN = ("datetime", "camera", "slot_id", "weather", "occupied")
 
 
 def weekday_of(day: str) -> int:
-    """Return the weekday of an ISO date, Monday = 0 ... Sunday = 6."""
     return date.fromisoformat(day).weekday()
 
 
@@ -116,15 +115,14 @@ class OccupancyLog:
     def __post_init__(self) -> None:
         slot, day = np.asarray(self.slot, np.int64), np.asarray(self.day, np.int64)
         second, occupied = np.asarray(self.second, float), np.asarray(self.occupied, bool)
-        if not slot.size:
-            raise InputError(f"{self.source}: no observations, want at least one")
+        require(slot.size, f"{self.source}: no observations, want at least one")
         if not slot.shape == day.shape == second.shape == occupied.shape == (slot.size,):
             raise InputError(f"{self.source}: want slot, day, second and occupied of one length")
-        if len(self.slot_ids) * len(self.days) > MAX_RECORDS:
-            raise InputError(
-                f"{self.source}: has {len(self.slot_ids):,} slots on {len(self.days):,} days, "
-                f"want at most {MAX_RECORDS:,} slots times days"
-            )
+        require(
+            len(self.slot_ids) * len(self.days) <= MAX_RECORDS,
+            f"{self.source}: has {len(self.slot_ids):,} slots on {len(self.days):,} days, "
+            f"want at most {MAX_RECORDS:,} slots times days",
+        )
         for name, index, size in (("slot", slot, len(self.slot_ids)), ("day", day, len(self.days))):
             if index.min() < 0 or index.max() >= size:
                 raise InputError(f"{self.source}: {name}: want indices from 0 to {size - 1}")
@@ -213,8 +211,7 @@ class OccupancyLog:
         key = (what, *days.tolist())
         if key not in self._models:
             self._models[key] = fit(days)
-        model: _Model = self._models[key]
-        return model
+        return self._models[key]  # type: ignore[no-any-return]
 
     def _with(self, other: Self) -> Self:
         odd = set(self.slot_ids) ^ set(other.slot_ids)
@@ -252,9 +249,10 @@ class OccupancyLog:
         Where observations follow from changes, as in days of a fleet, they would say that states change within a
         second. The pairs of such a log are `SAMPLE_S` apart, at times that do not depend on the states.
         """
-        if self._has_each_change:
-            return self._samples(min(SAMPLE_S, max_gap_s))
         same_record = np.diff(self._record) == 0
+        changes = same_record & (np.diff(self.occupied.astype(np.int8)) != 0)
+        if changes.any() and np.diff(self.second)[changes].max() <= 1.0:  # a log of each change
+            return self._samples(min(SAMPLE_S, max_gap_s))
         earlier = np.flatnonzero(same_record & (np.diff(self.second) <= max_gap_s))
         later = earlier + 1
         slot, day = self.slot[earlier], self.day[earlier]
@@ -262,18 +260,11 @@ class OccupancyLog:
             slot, day, self.second[earlier], self.second[later], self.occupied[earlier], self.occupied[later]
         )
 
-    @cached_property
-    def _has_each_change(self) -> bool:
-        """Whether all changes, of which there are some, lie between observations a second apart."""
-        changes = (np.diff(self._record) == 0) & (np.diff(self.occupied.astype(np.int8)) != 0)
-        return bool(changes.any() and np.diff(self.second)[changes].max() <= 1.0)
-
     @property
     def _record(self) -> IntArray:
         return self.day * len(self.slot_ids) + self.slot
 
     def _samples(self, each_s: float) -> Intervals:
-        """Return the states of all slots each so many seconds, from the first to the last observation of a day."""
         grid = np.arange(0.0, DAY_S, each_s)
         observed = np.flatnonzero(np.diff(self.first))
         begin, end = self.second[self.first[observed]], self.second[self.first[observed + 1] - 1]
@@ -305,8 +296,7 @@ class OccupancyLog:
             used &= days
         window = slice(*(hour * DAY_PERIODS // DAY_HOURS for hour in hours))
         occupied, seen = (seconds[:, used, window].sum(axis=(1, 2)) for seconds in self._periods)
-        mean: FloatArray = np.divide(occupied, seen, out=np.full(occupied.shape, np.nan), where=seen > 0)
-        return mean
+        return np.divide(occupied, seen, out=np.full(occupied.shape, np.nan), where=seen > 0)  # type: ignore[no-any-return]
 
     @property
     def recorded(self) -> BoolArray:
@@ -381,16 +371,12 @@ def csv_columns(
     path: Path, rows: Iterator[tuple[int, list[str]]], known: Sequence[str], needed: Sequence[str]
 ) -> list[int]:
     _, header = next(rows, (0, []))
-    if not header:
-        raise InputError(f"{path}: empty, want a header with the columns {', '.join(needed)}")
+    require(header, f"{path}: empty, want a header with the columns {', '.join(needed)}")
     for name in header:
-        if name not in known:
-            raise InputError(f"{path}: column {name!r} is unknown, want some of {', '.join(known)}")
-        if header.count(name) > 1:
-            raise InputError(f"{path}: column {name!r} stands there twice, want it once")
+        require(name in known, f"{path}: column {name!r} is unknown, want some of {', '.join(known)}")
+        require(header.count(name) <= 1, f"{path}: column {name!r} stands there twice, want it once")
     for name in needed:
-        if name not in header:
-            raise InputError(f"{path}: column {name!r} is missing, want {', '.join(needed)}")
+        require(name in header, f"{path}: column {name!r} is missing, want {', '.join(needed)}")
     return [header.index(name) for name in needed]
 
 

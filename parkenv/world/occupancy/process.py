@@ -5,12 +5,14 @@ Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, ClassVar, NamedTuple, Self
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,18 +21,23 @@ from scipy.optimize import brentq
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.compiled.memory import address_of
-from parkenv.errors import InputError, naming, require_number
+from parkenv.errors import InputError, naming, require, require_number
+from parkenv.files.field_types import Probability, Validated, as_array
 from parkenv.files.limited_reading import JsonFormat
 from parkenv.world.occupancy import kernel as kernels
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.centred_logits import centring_table
 from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
-from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, draw_arrival, kernel
+from parkenv.world.occupancy.kernel import (
+    EXTERNAL_KIND,
+    FUNCTIONS,
+    PROCESS_KIND,
+    draw_arrival,
+    hour_of_week,
+    kernel,
+)
 from parkenv.world.occupancy.log import weekday_of
-from parkenv.world.occupancy.python_functions import functions_of
-from parkenv.world.occupancy.slot_law import SlotLaw
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, WEEK_S
-from parkenv.world.week_hours import hour_of_week
 
 MAX_RATE = 1e3
 _FORMAT = JsonFormat("parkenv-occupancy-process", 1, "an occupancy process")
@@ -38,20 +45,63 @@ _FORMAT = JsonFormat("parkenv-occupancy-process", 1, "an occupancy process")
 
 @dataclass(frozen=True)
 class Arrival:
-    """The moment at which a search begins."""
-
     time: float  # s since Monday 00:00
     day: str = ""  # ISO date of the recorded day that the world replays; empty without a replay
 
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Occupancy forecast of a lot, before any observation."""
-
     p_occupied: FloatArray  # (n,) float64, P(taken) at the arrival
     # (n,) float64, 1/s, arrival rate plus departure rate: how fast an observation loses its value
     decay_rate: FloatArray
     day_error: DayError = EXACT  # by how much whole days differ from `p_occupied`
+
+
+class SlotLaw(NamedTuple):
+    """Independent two-state Markov chains from an arrival on, one per slot, with rates by the hour.
+
+    Examples:
+        Half of the cars leave within ln 2 mean stays; nobody comes.
+
+        >>> law = SlotLaw(np.ones(1), np.zeros((2, 1)), np.full((2, 1), 1 / 600.0), 100.0)
+        >>> round(float(law.p_taken_after(600 * np.log(2))[0]), 6)
+        0.5
+        >>> round(float(law.stays(50.0, 50.0 + 600 * np.log(2))[0]), 6)
+        0.5
+    """
+
+    p_taken: FloatArray  # (n,) float64, P(taken) at the arrival
+    # (2, n) float64, 1/s, rates at which free slots are taken in the hour of the arrival, and in the next
+    arriving: FloatArray
+    leaving: FloatArray  # (2, n) float64, 1/s, rates at which taken slots become free
+    hour_ends_s: float  # s from the arrival to the end of its hour
+
+    @property
+    def known_for_s(self) -> float:
+        return self.hour_ends_s + HOUR_S
+
+    def take(self, slots: IntArray) -> SlotLaw:
+        return SlotLaw(self.p_taken[slots], self.arriving[:, slots], self.leaving[:, slots], self.hour_ends_s)
+
+    def p_taken_after(self, seconds: ArrayLike) -> FloatArray:
+        """Return P(taken) of each slot at a time of its own, (..., n) s after the arrival."""
+        p, end = self.p_taken, np.asarray(seconds, np.float64)
+        for arriving, leaving, spent in zip(self.arriving, self.leaving, self._spent(0.0, end), strict=True):
+            rate = arriving + leaving
+            usual = np.divide(arriving, rate, out=np.zeros_like(rate), where=rate > 0.0)
+            p = usual + (p - usual) * np.exp(-rate * spent)
+        return np.asarray(p)
+
+    def stays(self, begin: ArrayLike, end: ArrayLike) -> FloatArray:
+        """Return P(one car stays until `end`), given that the slot is taken at `begin`; times as above."""
+        spent = self._spent(np.asarray(begin, np.float64), np.asarray(end, np.float64))
+        hazard = sum(leaving * seconds for leaving, seconds in zip(self.leaving, spent, strict=True))
+        return np.asarray(np.exp(-hazard))
+
+    def _spent(self, begin: ArrayLike, end: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the seconds of a span that are in the hour of the arrival, and after it."""
+        first = np.clip(end, None, self.hour_ends_s) - np.clip(begin, None, self.hour_ends_s)
+        return first, np.asarray(end) - np.asarray(begin) - first
 
 
 class World(ABC):
@@ -70,7 +120,6 @@ class World(ABC):
         """(k,) int64, number of the current sojourn (period of constant state) of each slot; distinguishes cars."""
 
     def law(self) -> SlotLaw | None:
-        """Return the law of the slots, given all that they have in common, such as the day; None: it is not known."""
         return None
 
     def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
@@ -96,11 +145,45 @@ class World(ABC):
         By default that of a FUNCTIONS record, whose functions call this object's methods. A world with compiled
         functions of its own returns the address of a record that holds theirs.
         """
-        return functions_of(self)
+        if _worlds.get(id(self)) is not self:
+            addresses = (ctypes.cast(function, ctypes.c_void_p).value for function in _FUNCTIONS)
+            _worlds[id(self)] = self
+            # Kept in the world itself; a copy of the world is not among `_worlds` yet and gets a record of its own.
+            vars(self)["_functions"] = np.array([(id(self), *addresses)], FUNCTIONS)
+        return address_of(vars(self)["_functions"], FUNCTIONS)
+
+
+_worlds: WeakValueDictionary[int, World] = WeakValueDictionary()
+_errors: list[BaseException] = []
+_TYPE = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_int64, ctypes.c_int64, ctypes.c_double)
+
+
+def _function(method: str) -> Any:
+    """Return a function (number of the world, slot, time, s) that calls a method of the world for a slot."""
+
+    def call(number: int, slot: int, time: float) -> float:
+        try:
+            return float(np.asarray(getattr(_worlds[number], method)(np.array([slot]), time)).item())
+        except BaseException as error:
+            _errors.append(error)
+            return time
+
+    return _TYPE(call)
+
+
+# By which compiled code asks a world that is written in Python; in the order of the fields of FUNCTIONS.
+_FUNCTIONS = tuple(_function(method) for method in ("occupied", "next_free"))
+
+
+def raise_error() -> None:
+    """Raise the first exception of a world in Python that compiled code has asked since the last call, if any."""
+    if _errors:
+        first = _errors[0]
+        _errors.clear()
+        raise first
 
 
 def checked_slots(slots: ArrayLike, n: int) -> IntArray:
-    """Return indices of slots, from 0 to n - 1, as an array for compiled code."""
     slots = np.ascontiguousarray(slots, np.int64)
     if slots.size and not (slots.min() >= 0 and slots.max() < n):
         raise IndexError("slot index out of range")
@@ -108,8 +191,6 @@ def checked_slots(slots: ArrayLike, n: int) -> IntArray:
 
 
 class ArrivalDay(NamedTuple):
-    """A day on which a search may begin."""
-
     weekday: int  # Monday = 0
     date: str = ""  # ISO date of a recorded day; else empty
 
@@ -131,15 +212,11 @@ class CompiledModel(NamedTuple):
 
 
 class PriorModel(ABC):
-    """Forecasts occupancy: the base class of all forecasts.
+    """Forecasts occupancy: the base class of all forecasts."""
 
-    Attributes:
-        kind: which records compiled code reads, see `compiled` and `World.address`.
-        adjustable: whether `at_mean_occupancy` and `with_day_error` can be called.
-    """
-
+    # which records compiled code reads, see `compiled` and `World.address`
     kind: ClassVar[int] = EXTERNAL_KIND
-    adjustable: ClassVar[bool] = False
+    adjustable: ClassVar[bool] = False  # whether `at_mean_occupancy` and `with_day_error` can be called
 
     @property
     @abstractmethod
@@ -166,7 +243,6 @@ class PriorModel(ABC):
         return self
 
     def for_world(self, world: OccupancyModel) -> PriorModel:  # noqa: ARG002 - subclasses use it
-        """Return this forecast beside another world of the lot."""
         return self
 
 
@@ -175,14 +251,10 @@ class OccupancyModel(PriorModel):
 
     A subclass needs `n_slots`, `forecast` and `world`; it then works in environments and their batches, in fleets and
     in studies.
-
-    Attributes:
-        recorded: whether worlds replay dated days, see `days_in`.
-        averaged: number of worlds whose mean is the expectation of a day.
     """
 
-    recorded: ClassVar[bool] = False
-    averaged: ClassVar[int] = 100
+    recorded: ClassVar[bool] = False  # whether worlds replay dated days, see `days_in`
+    averaged: ClassVar[int] = 100  # number of worlds whose mean is the expectation of a day
 
     @abstractmethod
     def world(self, key: np.uint64, arrival: Arrival) -> World:
@@ -193,7 +265,6 @@ class OccupancyModel(PriorModel):
         return []
 
     def arrival_days(self, window: ArrivalWindow) -> list[ArrivalDay]:
-        """Return the days on which searches begin, from which each draws one."""
         if self.recorded:
             return [ArrivalDay(weekday_of(day), day) for day in self.days_in(window)]
         return [ArrivalDay(weekday) for weekday in window.weekdays]
@@ -214,7 +285,6 @@ class OccupancyModel(PriorModel):
         return Course(occupied / self.averaged, residents / self.averaged)
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """Draw the day and the time of day at which the search with this key begins, both uniform."""
         days = self.arrival_days(window)
         day, second = draw_arrival(np.uint64(key), len(days), float(window.start_s), float(window.end_s))
         return Arrival(days[day].weekday * DAY_S + second, days[day].date)
@@ -222,6 +292,47 @@ class OccupancyModel(PriorModel):
     def with_fixed_slots(self, window: ArrivalWindow) -> Self:  # noqa: ARG002 - subclasses use it
         """Return this model with every slot of its data at the same slot of the lot on all days of a window."""
         return self
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantForecast(Validated, PriorModel):
+    """A `prior` of a `Scenario` with the same occupancy probability for every slot.
+
+    Examples:
+        >>> from parkenv import make_scenario
+        >>> mini = make_scenario("mini")
+        >>> ConstantForecast(1.0, mini.occupancy).forecast(Arrival(0.0)).p_occupied[:2].tolist()
+        [0.999, 0.999]
+    """
+
+    p_occupied: Probability  # the probability, 0 to 1; clipped to the range of forecasts
+    true: PriorModel  # provides the decay rates and the day error, which remain correct
+
+    @property
+    def kind(self) -> int:  # type: ignore[override]
+        return PROCESS_KIND if self.true.kind == PROCESS_KIND else EXTERNAL_KIND
+
+    def compiled(self, window: ArrivalWindow) -> CompiledModel | None:
+        model = self.true.compiled(window) if self.kind == PROCESS_KIND else None
+        if model is None:
+            return None
+        record = model.record.copy()
+        record["flat"] = min(max(self.p_occupied, kernels.MIN_PROBABILITY), kernels.MAX_PROBABILITY)
+        return model._replace(record=record)
+
+    @property
+    def n_slots(self) -> int:
+        return self.true.n_slots
+
+    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> ConstantForecast:
+        return replace(self, true=self.true.with_day_error(day_error, walk))
+
+    def for_world(self, world: OccupancyModel) -> ConstantForecast:
+        return replace(self, true=world)
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        p = min(max(self.p_occupied, kernels.MIN_PROBABILITY), kernels.MAX_PROBABILITY)
+        return replace(self.true.forecast(arrival), p_occupied=np.full(self.n_slots, p))
 
 
 @kernel
@@ -234,7 +345,6 @@ def _seek(
     occupied: BoolArray,
     ends: FloatArray,
 ) -> None:
-    """Write the state of each of `slots` at `time` and, if `ends` has room, when its sojourn ends."""
     of_all, here = kernels.process_at(process, 0), kernels.world_at(world, 0)
     for i in range(slots.size):
         slot, cursor = slots[i], kernels.cursor_at(cursors, slots[i])
@@ -273,8 +383,7 @@ class ProcessWorld(World):
     """
 
     def __init__(self, process: OccupancyProcess, key: np.uint64, arrival: Arrival) -> None:
-        if not math.isfinite(arrival.time):
-            raise InputError(f"Arrival.time is {arrival.time}, want finite seconds")
+        require(math.isfinite(arrival.time), f"Arrival.time is {arrival.time}, want finite seconds")
         # np.zeros does not touch its memory, so a million slots cost nothing until they are queried.
         self._cursors = np.zeros(process.n_slots, kernels.CURSOR)
         self.process = process
@@ -289,40 +398,34 @@ class ProcessWorld(World):
         return self.process.address
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
-        return self._seek(checked_slots(slots, self.process.n_slots), time, np.empty(0))
+        return self._seek(slots, time)[0]
 
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
-        slots = checked_slots(slots, self.process.n_slots)
-        ends = np.empty(slots.size)
-        return np.where(self._seek(slots, time, ends), ends, time)
+        occupied, ends = self._seek(slots, time, with_ends=True)
+        return np.where(occupied, ends, time)
 
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
-        slots = checked_slots(slots, self.process.n_slots)
-        self._seek(slots, time, np.empty(0))
-        begun: IntArray = self._cursors["sojourn"][slots].astype(np.int64)
-        return begun
+        self._seek(slots, time)
+        return self._cursors["sojourn"][np.asarray(slots, np.int64)].astype(np.int64)
 
     def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
-        slots = checked_slots(slots, self.process.n_slots)
-        ends = np.empty(slots.size)
-        self._seek(slots, time, ends)
+        _, ends = self._seek(slots, time, with_ends=True)
         return np.where(ends <= until, ends, np.inf)
 
     def law(self) -> SlotLaw:
         p_taken, rates = np.empty(len(self._cursors)), np.empty((4, len(self._cursors)))
         _laws(self.process.address, address_of(self._record, kernels.WORLD), p_taken, rates)
-        ends = HOUR_S - float(self._record["second_of_hour"][0])
-        return SlotLaw(p_taken, rates[:2], rates[2:], ends)
+        return SlotLaw(p_taken, rates[:2], rates[2:], HOUR_S - float(self._record["second_of_hour"][0]))
 
-    def _seek(self, slots: IntArray, time: float, ends: FloatArray) -> BoolArray:
-        arrival = float(self.arrival.time)
+    def _seek(self, slots: ArrayLike, time: float, with_ends: bool = False) -> tuple[BoolArray, FloatArray]:
+        arrival, chosen = float(self.arrival.time), checked_slots(slots, self.process.n_slots)
         if not arrival <= time < math.inf:
             raise InputError(f"time is {time}, want finite seconds at or after the arrival at {arrival}")
-        occupied = np.empty(slots.size, np.bool_)
+        occupied, ends = np.empty(chosen.size, np.bool_), np.empty(chosen.size if with_ends else 0)
         cursors = address_of(self._cursors, kernels.CURSOR)
         world = address_of(self._record, kernels.WORLD)
-        _seek(self.process.address, world, slots, float(time), cursors, occupied, ends)
-        return occupied
+        _seek(self.process.address, world, chosen, float(time), cursors, occupied, ends)
+        return occupied, ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,44 +477,43 @@ class OccupancyProcess(OccupancyModel):
     _centring: FloatArray = field(init=False, repr=False)  # `record` holds its address
 
     def __post_init__(self) -> None:
-        arrival = _checked("arrival_factor", self.arrival_factor)
-        factors = np.stack([arrival, _checked("departure_factor", self.departure_factor, arrival.size)])
+        arrival = as_array("arrival_factor", self.arrival_factor, -1, least=0.0)
+        departure = as_array("departure_factor", self.departure_factor, arrival.size, least=0.0)
         names = ("arrival_profile", "departure_profile")
-        profiles = np.stack([_checked(name, getattr(self, name), WEEK_HOURS) for name in names])
+        profiles = np.stack([as_array(name, getattr(self, name), WEEK_HOURS, least=0.0) for name in names])
+        factors = np.stack([arrival, departure])
         with np.errstate(over="ignore"):
             fastest = float((factors.max(axis=1) * profiles.max(axis=1)).max())
-        if not fastest <= MAX_RATE:
-            raise InputError(
-                f"OccupancyProcess has a rate of {fastest:g}/s, want factor * profile <= {MAX_RATE:g}"
-            )
+        require(
+            fastest <= MAX_RATE,
+            f"OccupancyProcess has a rate of {fastest:g}/s, want factor * profile <= {MAX_RATE:g}",
+        )
         hazards = np.pad(np.cumsum(profiles * HOUR_S, axis=1), ((0, 0), (1, 0)))
-        for name, array in (("factors", factors), ("profiles", profiles), ("hazards", hazards)):
+        for array in (factors, profiles, hazards):
             array.flags.writeable = False
-            object.__setattr__(self, name, array)
         # Untouched memory costs nothing, so even a million slots can have a whole week.
         marginals = np.zeros((WEEK_HOURS, arrival.size))
-        near, centring = self._checked_nearness(arrival.size), centring_table(self.day_error)
-        object.__setattr__(self, "hourly_marginals", marginals)
-        object.__setattr__(self, "nearness", near)
-        object.__setattr__(self, "_centring", centring)
+        near, centring = self.nearness, centring_table(self.day_error)
+        if near is not None:
+            near = as_array("nearness", near, arrival.size, least=-1.0, most=1.0)
+        require(
+            near is not None or self.day_error.slope == 0.0,
+            "nearness is None, want numbers: days have a slope",
+        )
         addresses = [address_of(a, np.float64) for a in (factors, profiles, hazards, marginals, centring)]
         near_at = 0 if near is None else address_of(near, np.float64)
         sizes = self.day_error.level, self.day_error.slope
         record = np.array([(arrival.size, *addresses, near_at, sizes, np.nan)], kernels.PROCESS)
-        object.__setattr__(self, "record", record)
-        for name, row in zip(_RATES, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
-            object.__setattr__(self, name, row)
-
-    def _checked_nearness(self, n: int) -> FloatArray | None:
-        if self.nearness is None:
-            if self.day_error.slope > 0.0:
-                raise InputError("OccupancyProcess.nearness is None, want numbers: its days have a slope")
-            return None
-        near = _numbers("nearness", self.nearness, n)
-        if not np.all(np.abs(near) <= 1.0):
-            raise InputError("OccupancyProcess.nearness: want numbers from -1 to 1")
-        near.flags.writeable = False
-        return near
+        rates = zip(_RATES, (factors[0], profiles[0], factors[1], profiles[1]), strict=True)
+        values: dict[str, Any] = {
+            "factors": factors,
+            "profiles": profiles,
+            "hazards": hazards,
+            "nearness": near,
+        }
+        values |= {"hourly_marginals": marginals, "_centring": centring, "record": record, **dict(rates)}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OccupancyProcess, tuple(getattr(self, name) for name in _FIELDS)
@@ -432,8 +534,7 @@ class OccupancyProcess(OccupancyModel):
         attraction, demand = np.asarray(attraction, float), np.asarray(demand, float)
         for name, logits in (("attraction", attraction), ("demand", demand)):
             # Beyond this, the exponential exceeds the floating-point range.
-            if not np.all(np.abs(logits) <= 300):
-                raise InputError(f"{name}: want finite logits between -300 and 300")
+            require(np.all(np.abs(logits) <= 300), f"{name}: want finite logits between -300 and 300")
         return cls(
             np.exp(attraction),
             np.exp(demand) / mean_stay_s,
@@ -485,12 +586,7 @@ class OccupancyProcess(OccupancyModel):
         return replace(self, arrival_factor=arrival, departure_factor=departure, nearness=near)
 
     def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> OccupancyProcess:
-        """Return this process with days that differ from its forecast.
-
-        Args:
-            day_error: by how much.
-            walk: (n,) walk from each slot to the goal, for a slope; None keeps the nearness of the slots.
-        """
+        """Return this process with days that differ from its forecast; `walk`, (n,) m, ranks its slots anew."""
         near = self.nearness if walk is None else nearness(walk)
         return replace(self, day_error=day_error, nearness=near)
 
@@ -524,10 +620,10 @@ class OccupancyProcess(OccupancyModel):
 
         fastest = float(self.arrival_factor.max() * self.arrival_profile.max())
         low, high = -100.0, math.log(0.99 * MAX_RATE / fastest) if fastest > 0 else 0.0
-        if not excess(low) < 0 < excess(high):
-            raise InputError(
-                f"target mean occupancy: {target} cannot be reached by scaling the arrival rates"
-            )
+        require(
+            excess(low) < 0 < excess(high),
+            f"target mean occupancy: {target} cannot be reached by scaling the arrival rates",
+        )
         return scaled(brentq(excess, low, high, xtol=1e-10))
 
     def marginal(self, time: float) -> FloatArray:
@@ -567,20 +663,3 @@ class OccupancyProcess(OccupancyModel):
 _FIELDS = tuple(f.name for f in fields(OccupancyProcess) if f.init)
 _RATES = _FIELDS[:4]
 _TABLES = ("factors", "profiles", "hazards", "hourly_marginals")
-
-
-def _checked(name: str, values: Any, size: int | None = None) -> FloatArray:
-    array = _numbers(name, values, size)
-    for i in np.flatnonzero(~((array >= 0) & np.isfinite(array))):
-        raise InputError(f"OccupancyProcess.{name}[{i}] is {array[i]}, want a finite number >= 0")
-    return array
-
-
-def _numbers(name: str, values: Any, size: int | None = None) -> FloatArray:
-    try:
-        array = np.array(values, float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"OccupancyProcess.{name}: {error}, want numbers") from error
-    if array.ndim != 1 or not array.size or array.size != (size or array.size):
-        raise InputError(f"OccupancyProcess.{name} has shape {array.shape}, want ({size or 'n'},), not empty")
-    return array

@@ -17,7 +17,8 @@ from scipy.special import logit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of, float64s, int64s, uint8s
-from parkenv.errors import InputError, require_one_of
+from parkenv.errors import InputError, require, require_one_of
+from parkenv.files.field_types import as_array
 from parkenv.files.known_names import FORECAST_FROM, ForecastFrom
 from parkenv.files.limited_reading import csv_rows
 from parkenv.forecast.slot_days import MAX_DAYS, fit_slot_days
@@ -49,7 +50,6 @@ from parkenv.world.week import DAY_S
 
 
 def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
-    """Read the log slot of each slot of a lot, (n,) int64, from a CSV file with `slot_id` and `log_slot_id`."""
     path = Path(path)
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
     lot_index = {slot_id: i for i, slot_id in enumerate(lot_slot_ids)}
@@ -75,8 +75,16 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
     return mapping
 
 
+def _decay_rates(log: OccupancyLog, days: IntArray) -> FloatArray:
+    pairs = log.intervals(log.max_gap_s)
+    used = np.isin(pairs.day, days)
+    require(
+        used.any(), f"{log.source}: no two observations in a row on the days that are left to forecast from"
+    )
+    return fit_hourly_decay_rates(pairs.start[used], pairs.end[used], pairs.before[used], pairs.after[used])
+
+
 def same_slots(lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
-    """Return the log slot of each slot of a lot, (n,) int64: that of the same name."""
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
     if missing := [slot_id for slot_id in lot_slot_ids if slot_id not in log_index]:
         raise InputError(
@@ -86,41 +94,30 @@ def same_slots(lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
 
 
 @kernel
-def _occupied(days: int, slots: IntArray, second: float, occupied: BoolArray) -> None:
-    """Write whether each slot is taken at a second of the day."""
-    day = recorded_day_at(days, 0)
-    for i in range(slots.size):
-        occupied[i] = uint8s(day.occupied)[recorded_index(day, slots[i], second)] != 0
+def _query(
+    days: int, slots: IntArray, second: float, occupied: BoolArray, free_from: FloatArray, changes: IntArray
+) -> None:
+    """Write whether each slot is taken at a second of the day, and how often its state has changed until then.
 
-
-@kernel
-def _next_state(days: int, slots: IntArray, second: float, taken: BoolArray, since: FloatArray) -> None:
-    """Write the first second >= `second` at which each slot is taken or not, as `taken` says; inf if never."""
+    `free_from` is the first second from then on at which it is free, infinite if never.
+    """
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
         k, end = recorded_index(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
-        since[i] = second
-        while k < end and (uint8s(day.occupied)[k] != 0) != taken[i]:
+        occupied[i], free_from[i] = uint8s(day.occupied)[k] != 0, second
+        changes[i] = recorded_changes(day, slots[i], second)
+        while k < end and uint8s(day.occupied)[k] != 0:
             k += 1
-            since[i] = float64s(day.from_s)[k] if k < end else np.inf
+            free_from[i] = float64s(day.from_s)[k] if k < end else np.inf
 
 
 @kernel
-def _changes(days: int, slots: IntArray, second: float, count: IntArray) -> None:
-    """Write how often each slot's state has changed between its first observation and `second`."""
-    for i in range(slots.size):
-        count[i] = recorded_changes(recorded_day_at(days, 0), slots[i], second)
-
-
-@kernel
-def _forecast(days: int, second: float, p: FloatArray, decay_rate: FloatArray) -> None:
+def _forecast(days: int, second: float, p: FloatArray, decay_rate: FloatArray) -> float:
+    """Write the forecast of the slots at a second of the day, and return the deviation of their level, logits."""
+    day = recorded_day_at(days, 0)
     for slot in range(p.size):
-        p[slot], decay_rate[slot] = recorded_forecast(recorded_day_at(days, 0), slot, second)
-
-
-@kernel
-def _day_level(days: int, second: float) -> float:
-    return float(recorded_day_level(recorded_day_at(days, 0), second))
+        p[slot], decay_rate[slot] = recorded_forecast(day, slot, second)
+    return float(recorded_day_level(day, second))
 
 
 class RecordedWorld(World):
@@ -133,41 +130,23 @@ class RecordedWorld(World):
         self._midnight = float(self._day["midnight"][0])
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
-        slots, second = checked_slots(slots, self._occupancy.n_slots), self._second(time)
-        occupied = np.empty(slots.size, np.bool_)
-        _occupied(address_of(self._day, RECORDED_DAY), slots, second, occupied)
-        return occupied
+        return self._query(slots, time)[0]
 
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
-        slots, second = checked_slots(slots, self._occupancy.n_slots), self._second(time)
-        free_from = np.empty(slots.size)
-        _next_state(
-            address_of(self._day, RECORDED_DAY), slots, second, np.zeros(slots.size, np.bool_), free_from
-        )
-        return np.maximum(free_from + self._midnight, time)
-
-    def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
-        slots, second = checked_slots(slots, self._occupancy.n_slots), self._second(time)
-        since = np.empty(slots.size)
-        _next_state(address_of(self._day, RECORDED_DAY), slots, second, ~self.occupied(slots, time), since)
-        changes = since + self._midnight
-        # Rounding: the first float64 whose second of the day is not before the change.
-        for near in (np.nextafter(changes, np.inf), changes, np.nextafter(changes, -np.inf)):
-            changes = np.where(near - self._midnight >= since, near, changes)
-        return np.where(changes <= until, changes, np.inf)
+        return np.maximum(self._query(slots, time)[1] + self._midnight, time)
 
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
-        slots, second = checked_slots(slots, self._occupancy.n_slots), self._second(time)
-        count = np.empty(slots.size, np.int64)
-        _changes(address_of(self._day, RECORDED_DAY), slots, second, count)
-        return count
+        return self._query(slots, time)[2]
 
-    def _second(self, time: float) -> float:
+    def _query(self, slots: ArrayLike, time: float) -> tuple[BoolArray, FloatArray, IntArray]:
         if not self.arrival.time <= time < math.inf:
             raise InputError(
                 f"time is {time}, want finite seconds from the arrival at {self.arrival.time} on"
             )
-        return float(time) - self._midnight
+        slots = checked_slots(slots, self._occupancy.n_slots)
+        answers = np.empty(slots.size, np.bool_), np.empty(slots.size), np.empty(slots.size, np.int64)
+        _query(address_of(self._day, RECORDED_DAY), slots, float(time) - self._midnight, *answers)
+        return answers
 
 
 class MappedLog(NamedTuple):
@@ -181,8 +160,6 @@ class MappedLog(NamedTuple):
 
 
 class ReplayForecast(NamedTuple):
-    """Forecast of a replayed day."""
-
     log_odds: FloatArray  # (n, 48) of P(taken), in the middles of the half-hours
     day_level: FloatArray  # (48,) standard deviation of the error of the lot's level, logits
     decay_rate: FloatArray  # (24,) 1/s, by hour
@@ -222,15 +199,14 @@ class RecordedOccupancy(OccupancyModel):
     _forecasts: dict[int, ReplayForecast] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        walk = np.array(self.walk_m, float)
-        if walk.ndim != 1 or not walk.size or not np.all((walk >= 0) & np.isfinite(walk)):
-            raise InputError(f"walk_m has shape {walk.shape}, want (n,) finite metres >= 0")
-        object.__setattr__(self, "walk_m", walk)
+        object.__setattr__(self, "walk_m", as_array("walk_m", self.walk_m, -1, least=0.0))
         if self.mapping is not None:
-            mapping = np.array(self.mapping, np.int64)
-            m = len(self.log.slot_ids)
-            if mapping.shape != walk.shape or mapping.min() < 0 or mapping.max() >= m:
-                raise InputError(f"mapping: want ({walk.size},) indices of log slots from 0 to {m - 1}")
+            mapping, m = (
+                as_array("mapping", self.mapping, self.n_slots, dtype=np.int64),
+                len(self.log.slot_ids),
+            )
+            if mapping.min() < 0 or mapping.max() >= m:
+                raise InputError(f"mapping: want ({self.n_slots},) indices of log slots from 0 to {m - 1}")
             object.__setattr__(self, "mapping", mapping)
         require_one_of("forecast_from", self.forecast_from, FORECAST_FROM)
         if self.replay_from is None and self.forecast_from != "others":
@@ -283,9 +259,8 @@ class RecordedOccupancy(OccupancyModel):
         second = self._second(arrival)
         day = self.day_records([arrival.day])
         p, decay_rate = np.empty(self.n_slots), np.empty(self.n_slots)
-        address = address_of(day, RECORDED_DAY)
-        _forecast(address, second, p, decay_rate)
-        return Forecast(p, decay_rate, DayError(_day_level(address, second)))
+        level = _forecast(address_of(day, RECORDED_DAY), second, p, decay_rate)
+        return Forecast(p, decay_rate, DayError(level))
 
     def day_records(self, days: Sequence[str], forecast: bool = True) -> NDArray[np.void]:
         """Return recorded days for compiled code, (k,) of the dtype RECORDED_DAY; valid while this object lives."""
@@ -357,7 +332,7 @@ class RecordedOccupancy(OccupancyModel):
 
     def _forecast_day(self, day: int, mapped: MappedLog) -> ReplayForecast:
         log, known = self.log, mapped.known
-        rates = log.fitted("decay rates", known, self._decay_rates)
+        rates = log.fitted("decay rates", known, lambda days: _decay_rates(log, days))
         days_away = np.abs(log.dates(known).number - log.dates([day]).number)
         nearest = np.sort(known[np.argsort(days_away, kind="stable")[:MAX_DAYS]])
         fitted = log.fitted("slot days", nearest, lambda days: fit_slot_days(log.slot_days(days)))
@@ -367,17 +342,6 @@ class RecordedOccupancy(OccupancyModel):
         level = np.sqrt(np.einsum("j,pjk,k->p", share, forecast.level_covariance, share))
         p = np.clip(forecast.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
         return ReplayForecast(np.ascontiguousarray(logit(p)), np.minimum(level, MAX_LOGITS), rates)
-
-    def _decay_rates(self, known: IntArray) -> FloatArray:
-        pairs = self.log.intervals(self.log.max_gap_s)
-        used = np.isin(pairs.day, known)
-        if not used.any():
-            raise InputError(
-                f"{self.log.source}: no two consecutive observations on the days that are left to forecast from"
-            )
-        return fit_hourly_decay_rates(
-            pairs.start[used], pairs.end[used], pairs.before[used], pairs.after[used]
-        )
 
     def _assign(self, day: str, known: IntArray) -> IntArray:
         n, m = self.n_slots, len(self.log.slot_ids)
@@ -389,7 +353,6 @@ class RecordedOccupancy(OccupancyModel):
         return log_slot
 
     def _replay_days(self, log_slot: IntArray, replay_order: IntArray) -> IntArray:
-        """Return each lot slot's replay day, (n,): copies of a log slot, nearest first, in the days' order."""
         recorded = self.log.recorded[:, replay_order]
         since = "" if self.replay_from is None else f" from {self.replay_from} on"
         days = np.empty(self.n_slots, np.int64)

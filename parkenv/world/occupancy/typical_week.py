@@ -49,7 +49,6 @@ def typical_occupancy(
 
 
 def attraction(lot: ParkingLot, goal: int, pull: float, unevenness: float) -> FloatArray:
-    """Return the popularity of the slots, (n_slots,) logits; arguments: see `typical_occupancy`."""
     walk = lot.walk_m(goal)
     span = float(np.ptp(walk)) or 1.0
     nearness = 1.0 - 2.0 * (walk - walk.min()) / span
@@ -115,7 +114,6 @@ def _demand(popularity: FloatArray, wanted: FloatArray, mean_stay_s: float) -> F
     demand = np.empty(WEEK_HOURS)
 
     def after(p: FloatArray, logits: float) -> FloatArray:
-        """Follow the slots through an hour of constant rates."""
         odds = np.exp(popularity + logits)
         equilibrium = odds / (1.0 + odds)
         return np.asarray(equilibrium + (p - equilibrium) * np.exp(-(1.0 + odds) * HOUR_S / mean_stay_s))
