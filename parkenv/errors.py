@@ -17,6 +17,12 @@ class InputError(ValueError):
     """
 
 
+def ensure(condition: object, message: str) -> None:
+    """Raise an InputError with the message unless the condition holds."""
+    if not condition:
+        raise InputError(message)
+
+
 def needs_extra(what: str, extra: str) -> str:
     return f"{what} needs the extra {extra}: pip install 'parkenv[{extra}]'"
 

@@ -5,9 +5,8 @@ import dataclasses
 import pytest
 
 from parkenv.studies.training import configs
-from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.spec import TrainingSpec
-from parkenv.studies.training.training import Training, use_one_thread
+from parkenv.studies.training.training import Training, save_checkpoint, use_one_thread
 
 use_one_thread()  # as in the workers of a study: tests run side by side
 

@@ -16,8 +16,7 @@ from parkenv.cli.report import make_report
 from parkenv.show.figures.fleet import KNOWLEDGE_COLORS
 from parkenv.studies.fleet.day_replay import DRIVE, FAIL, QUEUE, choose_days, record_day
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.report_options import ReportOptions
-from parkenv.studies.study import ExecutionSpec
+from parkenv.studies.study import ExecutionSpec, ReportOptions
 
 
 @pytest.fixture(scope="module")

@@ -332,7 +332,6 @@ def test_a_task_names_both_sides_and_keeps_them_apart(folder):
     assert names[0] | names[1] == {spec.title for spec in specs}
     assert not names[0] & names[1]
     assert sorted(training.settings()["held_out"]) == sorted(names[1])
-    assert training.announcement.endswith(", ".join(one.name for one in training.sides[1]))
     assert [len(places) for places in training.tests.values()] == [len(side) for side in names]
     same = scenario_spec(folder / "busy.toml").changed(name="again")
     for others, message in (

@@ -19,10 +19,9 @@ from parkenv.show.report.tables import table_of
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.search_replay import Encounter, choose, replay
 from parkenv.studies.report import RunFolder
-from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import EPISODES
 from parkenv.studies.sensing.sessions import SESSIONS
-from parkenv.studies.study import ExecutionSpec
+from parkenv.studies.study import ExecutionSpec, ReportOptions
 from parkenv.world.lot import PARK
 from planners import make_agent
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from parkenv import InputError, SensorBand, SensorModel, Traffic, make_scenario
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.sensing.sensor_model_fit import BAND_ENDS, ObservationCounts, count_observations
+from parkenv.studies.sensing.sensor_model_fit import BAND_ENDS, count_observations, fitted_model
 from parkenv.world.lot import PARK
 from parkenv.world.sensor_model import SENSOR_MODEL_NAMES
 from planners import make_agent
@@ -91,14 +91,14 @@ def test_unseen_slots_are_known_once_they_were_tried():
 @given(st.floats(0.7, 1.0), st.floats(0.0, 0.3), st.floats(0.1, 1.0), st.integers(0, 99))
 def test_counts_give_the_rates_that_they_were_drawn_from(hit, false_alarm, seen, seed):
     rng = np.random.default_rng(seed)
-    n, looks = 4000, ObservationCounts.none().counts
+    n, looks = 4000, np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64)
     for band in range(len(BAND_ENDS)):
         for side in (0, 1):
             for taken, rate in ((0, false_alarm), (1, hit)):
                 told = rng.binomial(n, seen)
                 said = rng.binomial(told, rate)
                 looks[band, side, taken] = n - told, told - said, said
-    model = ObservationCounts(looks).fitted()
+    model = fitted_model(looks)
     rates = model.rates(np.array(BAND_ENDS), np.ones(len(BAND_ENDS), dtype=bool))
     np.testing.assert_allclose(rates.seen, seen, atol=0.03)
     np.testing.assert_allclose(rates.hit, hit, atol=0.1)
@@ -107,18 +107,18 @@ def test_counts_give_the_rates_that_they_were_drawn_from(hit, false_alarm, seen,
 
 def test_too_few_looks_are_refused():
     with pytest.raises(InputError, match="want at least 20 of each"):
-        ObservationCounts.none().fitted()
+        fitted_model(np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64))
 
 
 def test_looks_of_a_real_search_are_counted():
     """Every slot in view after every step is counted once, and most reported states are correct."""
     scenario = make_scenario("mini")
-    looks = count_observations(scenario, "laser", "greedy-drive", range(3), "overcast").counts
+    looks = count_observations(scenario, "laser", "greedy-drive", range(3), "overcast")
     said = looks.sum(axis=(0, 1))
     assert said.sum() >= 10
     right = said[0, 1] + said[1, 2]
     assert right >= 0.9 * said[:, 1:].sum() > 0
-    again = count_observations(scenario, "laser", "greedy-drive", range(3), "overcast").counts
+    again = count_observations(scenario, "laser", "greedy-drive", range(3), "overcast")
     np.testing.assert_array_equal(looks, again)
     with pytest.raises(InputError, match="rig is 'sonar'"):
         count_observations(scenario, "sonar", "mdp", [0])

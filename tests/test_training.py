@@ -4,7 +4,6 @@ import base64
 import json
 import pathlib
 import pickle
-import shutil
 import tempfile
 import zipfile
 
@@ -25,13 +24,14 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
-from parkenv.scenarios.spec import scenario_spec
+from parkenv.lots import grid_lot
 from parkenv.studies.compare.cases import Case
+from parkenv.studies.runner import run
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import MAX_STEPS, SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.spec import TrainingSpec
-from parkenv.studies.training.training import TRAINING_SEEDS, Training, episode_times
+from parkenv.studies.training.training import TRAINING_SEEDS, episode_times
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
 from planners.agent import make_agent
@@ -200,11 +200,11 @@ def test_a_model_decides_on_driven_trips(trained):
     """On the lanes of the same world, it drives as in the search environment, as long as no attempt fails."""
     name = f"maskable-ppo:{trained / 'model.safetensors'}"
     search = DrivenSearch(SCENARIO, name)
-    planned = {row["seed"]: row for row in Case(SCENARIO, name).run(range(6))}
+    planned = {row["seed"]: row for row in Case(SCENARIO, name).run(range(3))}
     trips = [search.run(seed) for seed in planned]
     assert all(trip.parked for trip in trips)
     same = [trip.slot == planned[trip.seed]["slot"] for trip in trips]
-    assert sum(same) >= 4
+    assert sum(same) >= 2
 
 
 class Payload:
@@ -305,10 +305,10 @@ def test_archives_of_stable_baselines3_need_trust_and_are_converted(tmp_path):
     assert not mark.exists()
     done = parkenv(*command, "--trust-model")
     assert (done.returncode, mark.exists()) == (0, True), done.stderr
-    made = LearnedAgent(SCENARIO, "maskable-ppo", tmp_path / "mine.safetensors")
+    agent = LearnedAgent(SCENARIO, "maskable-ppo", tmp_path / "mine.safetensors")
     observation = LocalObservation(gym.make("parkenv/Search-v2", scenario=SCENARIO)).reset(seed=0)[0]
     wanted, _ = model.predict(observation, deterministic=True, action_masks=observation["action_mask"])
-    assert made.predict(observation)[0] == wanted
+    assert agent.predict(observation)[0] == wanted
     assert parkenv(*command, "--trust-model").returncode == 2, "the converted file is not replaced"
 
 
@@ -329,7 +329,7 @@ def test_only_models_that_can_be_described_are_saved(tmp_path):
 def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
     make_small(monkeypatch)
     mark = tmp_path / "was_run"
-    torch.save({"format": "parkenv-checkpoint-2", "curve": Payload(mark)}, tmp_path / "checkpoint.pt")
+    torch.save({"format": "parkenv-checkpoint-3", "steps": Payload(mark)}, tmp_path / "checkpoint.pt")
     with pytest.raises(InputError, match="no checkpoint of this version"):
         search_training("ppo", 400, 400, [SCENARIO]).train(0, tmp_path)
     assert not mark.exists()
@@ -344,28 +344,62 @@ def checkpoint(tmp_path, monkeypatch):
     return training, tmp_path / "checkpoint.pt"
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "wanted"),
-    [
-        ("curve", [{"steps": 0}], "has no column 'total_s'"),
-        ("last", (), "does not fit this training"),
-        ("parameters", {}, "does not fit this training"),
-    ],
-)
-def test_a_checkpoint_that_does_not_fit_is_refused(checkpoint, name, value, wanted):
-    training, path = checkpoint
-    torch.save(torch.load(path, weights_only=True) | {name: value}, path)
-    with pytest.raises(InputError, match=wanted):
-        training.train(0, path.parent)
-
-
-def test_a_damaged_checkpoint_is_refused(checkpoint):
+def test_a_checkpoint_that_does_not_fit_or_is_damaged_is_refused(checkpoint):
     training, path = checkpoint
     data = bytearray(path.read_bytes())
+    torch.save(torch.load(path, weights_only=True) | {"parameters": {}}, path)
+    with pytest.raises(InputError, match="does not fit this training"):
+        training.train(0, path.parent)
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     with pytest.raises(InputError, match="is not as it was written"):
         training.train(0, path.parent)
+
+
+LOTS = [make_scenario(grid_lot(2, 6 + i), name=f"lot{i}") for i in range(6)]
+TRAININGS = {
+    **{name: lambda name=name: search_training(name, 1_500, 400, [SCENARIO]) for name in SEARCH_CONFIGS},
+    "curriculum": lambda: search_training("ppo", 1_536, 512, LOTS, episodes=8, curriculum="size"),
+}
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind != "maskable-ppo")) for kind in TRAININGS]
+)
+def test_a_stopped_training_goes_on_from_its_checkpoint(kind, tmp_path, monkeypatch):
+    """Killed right before its third checkpoint: the evaluation before it is repeated."""
+    make_small(monkeypatch)
+    training = TRAININGS[kind]()
+    stop_training(training, tmp_path, monkeypatch)
+    before, curve = read_curve(tmp_path / "curve.csv"), training.train(0, tmp_path)
+    assert repr(curve[:2]) == repr(before[:2])
+    assert [row["steps"] for row in curve[:3]] == [row["steps"] for row in before]
+    assert curve[-1]["steps"] >= training.spec.steps
+    assert {path.name for path in tmp_path.iterdir()} == {"checkpoint.pt", "curve.csv", "model.safetensors"}
+    assert repr(training.train(0, tmp_path)) == repr(curve), "a finished training is not repeated"
+    if kind in SEARCH_CONFIGS:
+        model = LearnedAgent(SCENARIO, kind, tmp_path / "model.safetensors").model
+        times, _ = episode_times(model, SCENARIO, training.evaluation_seeds)
+        assert times.mean() == min(row["total_s"] for row in curve)
+
+
+def test_a_finished_training_goes_on_with_more_steps(tmp_path):
+    fields = {
+        "algorithm": "ppo",
+        "scenarios": ["mini"],
+        "trainings": 1,
+        "agents": [],
+        "evaluation_episodes": 4,
+    }
+    short, long = (TrainingSpec.parse({**fields, "steps": steps, "jobs": 1}, "") for steps in (600, 1_300))
+    before = run(short, tmp_path).summary["curve"]
+    after = run(long, tmp_path, resume=True).summary["curve"]
+    assert after[: len(before)] == before, "it goes on where it was"
+    assert after[-1]["steps"] >= 1_300 > before[-1]["steps"]
+    (tmp_path / "seed_0" / "checkpoint.pt").unlink()
+    assert run(short, tmp_path, resume=True).summary["curve"] == after, "no more than asked is nothing to do"
+    with pytest.raises(InputError, match="cannot go on"):
+        run(long.changed(steps=2_000), tmp_path, resume=True)
 
 
 def test_observations_of_another_kind_are_refused(trained):
@@ -413,31 +447,11 @@ def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch
     summary = json.loads((out / "summary.json").read_text())
     assert [row["seed"] for row in summary["rows"]] == [0, 1]
     assert all(row["steps"] >= steps for row in summary["rows"])
-    assert parkenv(*command, tmp_path / "longer", "--beside", out).returncode == 0
-    summary = json.loads((tmp_path / "longer" / "summary.json").read_text())
-    (means,) = summary["beside"].values()
-    assert [row["steps"] for row in means] == [row["steps"] for row in curve]
     compared = parkenv(
         "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.safetensors'}",
         "-n", 2, "--occupancy-levels", "none", "--no-figures", "--jobs", 1, "--out", tmp_path / "compared",
     )  # fmt: skip
     assert compared.returncode == 0, compared.stderr
-
-
-def training_in(folder, **changed):
-    settings = {"algorithm": "dqn", "scenario": ["mini"], "held_out": [], "evaluation_episodes": 16} | changed
-    (folder / "seed_0").mkdir(parents=True)
-    (folder / "seed_0" / "curve.csv").write_text("steps,total_s\n0,300.0\n10,90.0\n")
-    (folder / "settings.json").write_text(json.dumps(settings))
-    return str(folder)
-
-
-def curves_beside(folders, out):
-    spec = TrainingSpec(
-        algorithm="ppo", scenarios=(scenario_spec("mini"),), steps=10, evaluation_episodes=16, agents=(),
-        beside=tuple(folders),
-    )  # fmt: skip
-    return Training(spec).curves_beside(out)
 
 
 @pytest.mark.parametrize(
@@ -457,39 +471,11 @@ def test_trainings_that_make_no_sense_are_refused(fields, message):
         TrainingSpec.parse(fields, "file").training.check()
 
 
-def writes(name, text):
-    return lambda folder: (folder / name).write_text(text)
-
-
-@pytest.mark.parametrize(
-    ("changed", "spoil", "wanted"),
-    [
-        ({"scenario": ["mini", "jam"]}, None, r"scenario is \['mini', 'jam'\] in .* and \['mini'\] here"),
-        ({"evaluation_episodes": 8}, None, "evaluation_episodes is 8 in .* and 16 here"),
-        ({"scenario": 5}, None, r"other/settings\.json: scenario is 5, want a list"),
-        ({"scenario": [["mini"]]}, None, r"other/settings\.json: scenario\.0 is \['mini'\], want text"),
-        ({"algorithm": None}, None, r"other/settings\.json: algorithm is None, want text"),
-        ({}, lambda folder: shutil.rmtree(folder / "seed_0"), "holds no training"),
-        ({}, writes("settings.json", "{"), "settings.json: not JSON"),
-        ({}, writes("settings.json", "[]"), "want the settings of a command"),
-        ({}, writes("seed_0/curve.csv", "steps,total_s\n0\n"), "curve.csv: line 2: has 1 fields"),
-        ({}, writes("seed_0/curve.csv", "steps,success\n0,0.5\n"), "curve.csv: has no column 'total_s'"),
-    ],
-)
-def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil, wanted):
-    folder = training_in(tmp_path / "other", **changed)
-    if spoil is not None:
-        spoil(tmp_path / "other")
-    with pytest.raises(InputError, match=wanted):
-        curves_beside([folder], tmp_path / "own")
-
-
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
         ("ppo --curriculum age", "--curriculum is 'age', want 'size'"),
         ("ppo --evaluate-on nowhere", "unknown scenario 'nowhere'"),
-        ("dqn --clone mdp", "dqn has no behaviour cloning"),
         ("ppo --resume", "to resume"),
     ],
 )

@@ -19,7 +19,7 @@ import typer
 
 from parkenv.cli.command import Entry, make_app
 from parkenv.cli.stop_signals import stop_signals
-from parkenv.errors import InputError, needs_extra
+from parkenv.errors import InputError, ensure, needs_extra
 from parkenv.version import __version__
 from sim_sensors.errors import SensorError
 
@@ -33,7 +33,7 @@ COMMANDS = {
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", START),
     "run": Entry("Run an experiment file.", "study_command:Run", START),
     "train": Entry("Train agents by reinforcement learning.", "train", AGENTS),
-    "plan": Entry("Draw planned searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", AGENTS),
+    "plan": Entry("Draw planned searches, as in Fig. 4.9 to 4.12 of the thesis.", "plan:Plan", AGENTS),
     "benchmark": Entry("Run the benchmark suite, and check the results of others.", heading=AGENTS),
     "benchmark run": Entry("Run agents through all episodes of the suite.", "benchmark"),
     "benchmark check": Entry("Check results of the suite, and print them side by side.", "benchmark:Check"),
@@ -70,7 +70,6 @@ COMMANDS = {
         "Print the JSON schema of a kind of file, or write all schemas.", "study_command:Schema", DATA
     ),
 }
-"""Commands and groups of commands, as the help page lists them."""
 app = make_app(
     "Search for a free parking space: worlds, planners, and comparisons between them.",
     """
@@ -97,8 +96,7 @@ def _global_options(
     del version
 
 
-MAX_MESSAGE = 1_500
-"""Maximum length of an error message, characters."""
+MAX_MESSAGE = 1_500  # maximum length of an error message, characters
 
 
 def main() -> None:
@@ -127,14 +125,13 @@ def main() -> None:
 
 
 def _require_unicode(words: Sequence[str]) -> None:
-    """Refuse names of files in other encodings: results are JSON, and could not name them."""
     for word in words:
-        if word != word.encode(errors="replace").decode():
-            raise InputError(f"{word!a:.200} on the command line is not UTF-8")
+        ensure(
+            word == word.encode(errors="replace").decode(), f"{word!a:.200} on the command line is not UTF-8"
+        )
 
 
 def _report(error: BaseException) -> int:
-    """Print an error in a line; return the exit code."""
     match error:
         case InputError() | SensorError():
             return _complain(str(error))

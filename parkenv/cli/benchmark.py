@@ -7,6 +7,7 @@ from typing import Literal
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import command_line, make_console, print_rows, print_table
+from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several
 from parkenv.show.columns import Column, shared
@@ -56,7 +57,6 @@ class Page(Command):
     out: Path = option(Path("results/benchmark.html"), "The page.", short="-o", takes="FILE.html")
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
         from parkenv.show.report.page import write_page
         from parkenv.studies.benchmark.page import benchmark_data, result_files
         from parkenv.studies.benchmark.suite import check_result

@@ -33,13 +33,7 @@ Completer = Callable[[str], list[str]]
 
 
 def completer(names: Sequence[str] = (), suffixes: Sequence[str] = (), several: bool = False) -> Completer:
-    """Return a function that completes names, and files with one of the suffixes.
-
-    Args:
-        names: names to complete.
-        suffixes: how names of files end; empty for none.
-        several: complete the last of several values that are separated by commas.
-    """
+    """Return a function that completes names, and files with one of the suffixes; of `several`, the last."""
 
     def complete(incomplete: str) -> list[str]:
         before, comma, last = incomplete.rpartition(",") if several else ("", "", incomplete)
@@ -50,7 +44,6 @@ def completer(names: Sequence[str] = (), suffixes: Sequence[str] = (), several: 
 
 
 def _files(begun: str, suffixes: Sequence[str]) -> list[str]:
-    """Return files with one of the suffixes, and folders, whose path begins like this."""
     if not suffixes:
         return []
     folder, slash, name = begun.rpartition("/")
@@ -88,7 +81,6 @@ COMPLETERS: dict[str, Completer] = {
     "test_on": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),
     "weather": completer(WEATHERS, several=True),
 }
-"""How the values of an argument or option are completed."""
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 PANELS = ("Options", "Costs and speeds", "World", "Sensors", "Results", "Trust", "Machines")
@@ -121,7 +113,6 @@ class _Page:
         return [re.sub("[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]  # type: ignore[misc]
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
-        del ctx
         formatter.write_paragraph()
         with formatter.indentation():
             formatter.write_text(self.text)
@@ -195,7 +186,6 @@ class _CommandPage(_Page, TyperCommand):
         self.command_class.of(given).run()
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse arguments; an unknown option is answered by the nearest known one."""
         try:
             return super().parse_args(ctx, args)
         except typer.TyperException as error:
@@ -211,14 +201,12 @@ class _CommandPage(_Page, TyperCommand):
 
 class _GroupPage(_Page, TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse arguments; without any, print the help page."""
         if args or ctx.resilient_parsing:
             return super().parse_args(ctx, args)
         typer.echo(ctx.get_help())
         raise typer.Exit(2)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command; an unknown one is answered by the nearest known one."""
         if args[0] not in self.commands and not ctx.resilient_parsing and args[0][:1] != "-":
             raise InputError(
                 f"{ctx.command_path} has no command {args[0]!r}; {nearest(args[0], self.commands)}"
@@ -227,13 +215,7 @@ class _GroupPage(_Page, TyperGroup):
 
 
 def make_app(text: str, examples: str, entries: Mapping[str, Entry]) -> typer.Typer:
-    """Make the command line.
-
-    Args:
-        text: first lines of its help page.
-        examples: lines of that page.
-        entries: commands and groups by their words; a group comes before its commands.
-    """
+    """Make the command line of commands and groups by their words; a group comes before its commands."""
     app = _group("parkenv", Entry(text), examples, tuple(entries))
     groups = {"": app}
     for words, entry in entries.items():

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, print_rows, save_summary, stages
 from parkenv.errors import InputError
+from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import option
 from parkenv.files.spec_file import DetectorName, Several, require
 from parkenv.show.columns import Column
@@ -174,7 +175,6 @@ class TrainDetector(Command):
         return self
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import check_writable
         from parkenv.perception.hog import Descriptor
         from parkenv.perception.hog_detector import END, SIDE
         from parkenv.perception.training import TrainingSettings, train
@@ -259,7 +259,6 @@ class EvaluateDetector(Command):
         return self
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
         from parkenv.perception.car_datasets import read_crop_folder
         from parkenv.perception.detection_scores import recall_on_crops, score_on_uiuc
         from parkenv.show.figures.survey import save_recall_precision

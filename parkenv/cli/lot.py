@@ -13,7 +13,9 @@ from typer import Exit
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, print_rows, save_summary, stages, writing_into
-from parkenv.errors import InputError
+from parkenv.errors import InputError, ensure
+from parkenv.files.atomic_write import check_writable, write_together
+from parkenv.files.csv_tables import write_csv
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.files.option import Option, numbers_in, option
@@ -41,8 +43,7 @@ _LOT_COLUMNS = (
     Column("result", "result"),
     Column("reason", "reason"),
 )
-AUTO = "auto"
-"""Value of `--entry` and `--goal` that allows a guess."""
+AUTO = "auto"  # value of `--entry` and `--goal` that allows a guess
 LotName = Annotated[
     str,
     Field(description=f"{', '.join(SCENARIO_NAMES)}, or a lot file."),
@@ -131,7 +132,6 @@ class Check(Command):
 
 
 def _points(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
-    """Return the points of an option; `auto` stands for none."""
     numbers = (numbers_in(text, 2) for text in texts if text != AUTO)
     return tuple((p[0], p[1]) for p in numbers)
 
@@ -140,6 +140,14 @@ def _point(text: str) -> str:
     if text != AUTO:
         numbers_in(text, 2)
     return text
+
+
+def _square(text: str) -> tuple[float, ...]:
+    from parkenv.lots.local_frame import LocalFrame
+
+    lat, lon, metres = numbers_in(text, 3)
+    (west, south), (east, north) = LocalFrame(lon, lat).to_lonlat([[-metres] * 2, [metres] * 2]).tolist()
+    return south, west, north, east
 
 
 class Import(Command):
@@ -180,20 +188,20 @@ class Import(Command):
         parse=_point,
         default="where service roads meet a public street, or where streets leave the map",
     )
-    bounds: Several[float] | None = option(
-        None,
-        "Import only this area: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres; with --town, "
-        "latitudes and longitudes.",
-        takes="BOX",
-        parse=lambda text: tuple(numbers_in(text, 4)),
-    )
-    around: Several[float] | None = option(
-        None,
-        "Import only a square around this point, METRES to each side.",
-        takes="LAT,LON,METRES",
-        default="all of the map",
-        parse=lambda text: tuple(numbers_in(text, 3)),
-    )
+    bounds: Annotated[
+        Several[float] | None,
+        Field(
+            description="Import only this area: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres; with --town, "
+            "latitudes and longitudes."
+        ),
+        Option(takes="BOX", default="all of the map", parse=lambda text: tuple(numbers_in(text, 4))),
+        Option(
+            "--around",
+            takes="LAT,LON,METRES",
+            parse=_square,
+            description="Import only a square around this point, METRES to each side.",
+        ),
+    ] = None
     disabled: bool = option(False, "Also import spaces for disabled drivers.")
     left_hand: bool = option(False, "Left-hand traffic, which map files do not state.")
     split: bool = option(
@@ -228,7 +236,6 @@ class Import(Command):
         points = [point for point in (*self.goal, *self.entry) if point != AUTO]
         on_earth = all(abs(lat) <= 90.0 and abs(lon) <= 180.0 for lat, lon in self.box or ())
         require(not (self.split and self.town), "--split and --town: want one of them")
-        require(self.around is None or self.bounds is None, "--bounds and --around: want one of them")
         require(
             not (self.split and (points or self.box or self.picture or self.left_hand)),
             "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --around, --picture, "
@@ -245,14 +252,6 @@ class Import(Command):
 
     @property
     def box(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        if self.around is not None:
-            from parkenv.lots.local_frame import LocalFrame
-
-            lat, lon, metres = self.around
-            (west, south), (east, north) = (
-                LocalFrame(lon, lat).to_lonlat([[-metres] * 2, [metres] * 2]).tolist()
-            )
-            return (south, west), (north, east)
         if self.bounds is None:
             return None
         south, west, north, east = self.bounds
@@ -276,8 +275,6 @@ class Import(Command):
             with writing_into(self.out):
                 self._import_car_parks()
             return
-        from parkenv.files.atomic_write import check_writable
-        from parkenv.files.csv_tables import write_csv
         from parkenv.lots import import_lot, import_town, write_lot
         from parkenv.lots.draft import Provenance
         from parkenv.lots.formats.geojson import check_lot_output
@@ -285,8 +282,10 @@ class Import(Command):
 
         check_lot_output(self.out)
         table, town = self.out.with_suffix(".csv"), None
-        if self.picture is not None and self.picture.suffix.lower() != ".png":
-            raise InputError(f"--picture {self.picture}: want a name that ends in .png")
+        ensure(
+            self.picture is None or self.picture.suffix.lower() == ".png",
+            f"--picture {self.picture}: want a name that ends in .png",
+        )
         for file in (table if self.town else None, self.picture):
             if file is not None:
                 check_writable(file)
@@ -325,7 +324,6 @@ class Import(Command):
             console.print(caution, style="yellow")
 
     def _import_car_parks(self) -> None:
-        from parkenv.files.atomic_write import write_together
         from parkenv.studies.lots import import_town_lots
 
         console = make_console(soft_wrap=True)
@@ -405,7 +403,6 @@ def _print_each(console: Console, what: str, texts: Iterable[object], style: str
 
 
 def _provenance(path: Path) -> Provenance | None:
-    """Return what a lot file says of its import; None for a packaged lot or another format."""
     from parkenv.lots.draft import read_provenance
 
     is_json = path.suffix.lower() in (".json", ".geojson") and path.exists()

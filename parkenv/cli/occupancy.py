@@ -10,7 +10,7 @@ from pydantic import Field
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, print_rows, save_summary, stages
-from parkenv.files.atomic_write import make_folder
+from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import Date, scenario_spec
@@ -156,7 +156,6 @@ class Record(Command):
     out: Path = option(..., "The log, .csv or .csv.gz.", short="-o", takes="FILE")
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import check_writable
         from parkenv.studies.fleet.drivers import record_days
 
         check_writable(self.out)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import types
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -13,15 +13,13 @@ from keyword import iskeyword
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, Union, get_args, get_origin
 
-import annotated_types
 from pydantic.fields import FieldInfo
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, ensure
 from parkenv.files.option import Inside, Option
 from parkenv.files.spec_file import Spec, models_in
 
 SpecT = TypeVar("SpecT", bound=Spec)
-_SHOWN_BOUND = 1_000  # larger bounds only guard against mistakes
 _LETTERS = {int: "N", float: "X", Path: "FILE"}
 
 
@@ -48,7 +46,6 @@ class Command(Spec):
 
 
 def command_class(source: str) -> Any:
-    """Return the class of a command: `MODULE:CLASS` below `parkenv.cli`, or a kind of study."""
     module, _, name = source.partition(":")
     if name:
         return getattr(import_module(f"parkenv.cli.{module}"), name)
@@ -73,7 +70,6 @@ class FieldOption:
 
     @property
     def name(self) -> str:
-        """The option, such as `--episodes`; of an argument, its name in capitals."""
         name = self.path[-1]
         return self.option.name or (name.upper() if self.option.argument else f"--{name.replace('_', '-')}")
 
@@ -103,16 +99,14 @@ class FieldOption:
 
     @property
     def kind(self) -> Any:
-        """The type of a value."""
         kind = _bare(self.field.annotation)
         return get_args(kind)[0] if self.is_repeated else kind
 
     @property
     def takes(self) -> str:
-        """What the option takes: choices, or a letter with the field's bounds."""
         default = "DIR" if self.name == "--out" else self.name if self.option.argument else ""
         takes = self.option.takes or default
-        return takes if len(takes) > 2 else _taken(self.kind, self.field.metadata, takes)
+        return takes if len(takes) > 2 else _taken(self.kind, takes)
 
     @property
     def choices(self) -> tuple[str, ...]:
@@ -172,22 +166,16 @@ def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[Fie
 
 
 def spec_of(model: type[SpecT], given: Given, base: SpecT | None = None) -> SpecT:
-    """Return a specification as options make it.
+    """Return a specification as options make it: `base` changed, or a new one.
 
     An option of a table in a list, such as that of scenarios, changes every table of the list; options that set whole
     tables, such as `--scenario`, are applied first.
-
-    Args:
-        model: its class.
-        given: what was given, by option.
-        base: what to change; without it, what is not given has its default.
     """
     chosen: dict[tuple[str, ...], FieldOption] = {}
     for option in field_options(model if base is None else type(base)):
         if option.name in given:
             other = chosen.setdefault(option.path, option)
-            if other.name != option.name:
-                raise InputError(f"{other.name} and {option.name} exclude each other")
+            ensure(other.name == option.name, f"{other.name} and {option.name} exclude each other")
     return _with_values(model, base, {path: (o, o.value(given[o.name])) for path, o in chosen.items()})
 
 
@@ -217,7 +205,6 @@ def _with_values(model: type[SpecT], base: SpecT | None, values: _Values) -> Spe
 
 
 def _bare(annotation: Any) -> Any:
-    """Return a type without annotations and without None."""
     while True:
         if get_origin(annotation) is Annotated:
             annotation = get_args(annotation)[0]
@@ -246,29 +233,12 @@ def _converted(annotation: Any, text: str) -> object:
     return text
 
 
-def _taken(kind: Any, metadata: Collection[Any], letter: str = "") -> str:
+def _taken(kind: Any, letter: str = "") -> str:
     if get_origin(kind) is Literal:
         return "|".join(get_args(kind))
     if get_origin(kind) is tuple:
-        return f"{_taken(_bare(get_args(kind)[0]), (), letter)}[,...]"
-    letter = letter or _LETTERS.get(kind, "TEXT")
-    low = high = ""
-    for bound in metadata:
-        match bound:
-            case annotated_types.Ge(ge=value):
-                low = f"{value:g} <= {letter}"
-            case annotated_types.Gt(gt=value):
-                low = f"{value:g} < {letter}"
-            case annotated_types.Le(le=float() | int() as value) if value < _SHOWN_BOUND:
-                high = f"{letter} <= {value:g}"
-            case annotated_types.Lt(lt=float() | int() as value) if value < _SHOWN_BOUND:
-                high = f"{letter} < {value:g}"
-    if low and high:
-        return f"{low}{high.removeprefix(letter)}"
-    if low:
-        value, sign, _ = low.split()
-        return f"{letter} {sign.replace('<', '>')} {value}"
-    return high or letter
+        return f"{_taken(_bare(get_args(kind)[0]), letter)}[,...]"
+    return letter or _LETTERS.get(kind, "TEXT")
 
 
 def _shown(value: object) -> str:

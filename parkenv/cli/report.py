@@ -12,12 +12,12 @@ from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, stages
 from parkenv.cli.trust import Trust, require_trust
 from parkenv.errors import InputError
+from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import TRAFFIC, Agents, OneScenario, Seed
-from parkenv.studies.report_options import ReportOptions
-from parkenv.studies.study import ExecutionSpec
+from parkenv.studies.study import ExecutionSpec, ReportOptions
 
 
 class Report(Command, ExecutionSpec, ReportOptions):
@@ -55,16 +55,7 @@ def make_report(
     stage: str = "Running again",
     trust: bool = True,
 ) -> Path:
-    """Write the page on a run with a progress bar, and return its path.
-
-    Args:
-        folder: the run.
-        machines: where searches run again.
-        options: what to replay.
-        out: the page; None for `report.html` in the folder.
-        stage: what the progress bar says.
-        trust: run the classes that the run names, without asking.
-    """
+    """Write the page on a run with a progress bar, searching again on the machines of `machines`; return its path."""
     from parkenv.studies.report import RunFolder, write_report
 
     run = RunFolder.read(folder)
@@ -115,7 +106,6 @@ class Play(Command):
     out: Path = option(Path("results/play.html"), "The page.", short="-o", takes="FILE.html")
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
         from parkenv.scenarios.build import build
         from parkenv.show.report.page import write_game
         from parkenv.studies.play import game_data

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, print_rows, stages
+from parkenv.files.atomic_write import make_folder
 from parkenv.files.known_names import WEATHERS, RigName, WeatherName
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
@@ -26,12 +27,12 @@ class Preview(Command):
     """Each figure shows the measurements of all sensors in one weather, at the place with the most parked cars.
 
     It shows the side camera's image with the true boxes, its depth, the stereo camera's disparity, and the laser scan
-    from above. The command also writes a short video of the side camera.
+    from above.
     """
 
     examples = """
         parkenv sensors preview
-        parkenv sensors preview --scenario street --weather dusk --drive 40
+        parkenv sensors preview --scenario street --weather dusk
         """
 
     scenario: Annotated[OneScenario, AfterValidator(with_traffic), Inside(without=_OBSERVATIONS)] = Field(
@@ -44,12 +45,8 @@ class Preview(Command):
         default="all",
         parse=lambda t: WEATHERS if t == "all" else words_in(t),
     )
-    drive: float = option(
-        20.0, "Length of the video, m; 0 for none.", takes="0 <= M <= 10000", ge=0, le=10_000
-    )
-    every: float = option(0.5, "Metres between frames of the video.", takes="M", ge=0.05)
     seed: Seed = 0
-    out: Path = option(Path("results/sensors"), "Folder for the pictures and drive.gif.", short="-o")
+    out: Path = option(Path("results/sensors"), "Folder for the pictures.", short="-o")
 
     def run(self) -> None:
         from parkenv.scenarios.build import build
@@ -60,10 +57,7 @@ class Preview(Command):
             "The first image after an installation waits about 20 s for the renderer to be compiled."
         )
         with stages(console) as progress:
-            preview_sensors(
-                build(self.scenario), self.out, self.weather, drive=self.drive, every=self.every, seed=self.seed,
-                progress=progress,
-            )  # fmt: skip
+            preview_sensors(build(self.scenario), self.out, self.weather, seed=self.seed, progress=progress)
         console.print(f"Images are in {self.out}")
 
 
@@ -96,9 +90,8 @@ class FitSensorModel(Command, ExecutionSpec):
     out: Path = option(Path("sensor_model.json"), "The file to write.", short="-o", takes="FILE.json")
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
         from parkenv.scenarios.build import build
-        from parkenv.studies.sensing.sensor_model_fit import AGENTS, measure_sensors
+        from parkenv.studies.sensing.sensor_model_fit import AGENTS, fitted_model, measure_sensors
 
         specs = [with_traffic(spec) for spec in self.scenarios]
         scenarios, rig = [build(spec) for spec in specs], self.rig or specs[0].rig
@@ -116,9 +109,9 @@ class FitSensorModel(Command, ExecutionSpec):
                 workers=workers,
                 on_progress=counted(progress, "Searching with simulated sensors", total),
             )
-        model = counts.fitted()
+        model = fitted_model(counts)
         model.to_file(self.out)
-        in_range = counts.counts.reshape(-1, 2, 3).sum(axis=(1, 2)).tolist()
+        in_range = counts.reshape(-1, 2, 3).sum(axis=(1, 2)).tolist()
         rows = [{**asdict(band), "slots_in_range": n} for band, n in zip(model.bands, in_range, strict=True)]
         print_rows(console, f"Observations of slots, rig {rig}", rows, columns=(UP_TO,))
         console.print(f"Written: {self.out}")

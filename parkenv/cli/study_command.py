@@ -13,10 +13,12 @@ from parkenv.cli.options import Command, Given, command_class, field_options, sp
 from parkenv.cli.report import make_report
 from parkenv.cli.tables import command_line, make_console, print_table, stages
 from parkenv.cli.trust import Trust, TrustModel, readable_models, require_trust
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError, ensure, nearest
+from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Option, option
 from parkenv.studies.agent_spec import split_agents
 from parkenv.studies.results import SPEC_FILE, without_nan
+from parkenv.studies.runner import Interrupted, run
 from parkenv.studies.study import STUDIES, ExecutionSpec, Study, read_study, schemas, study_class
 
 if TYPE_CHECKING:
@@ -24,16 +26,10 @@ if TYPE_CHECKING:
 
     from parkenv.studies.runner import Result
 
-WITH_MORE = {
-    "compare": "compare:Compare",
-    "survey": "survey:Survey",
-    "demo": "demo:Demo",
-    "park": "drive:Park",
-}
-"""Commands of studies that have options besides the fields of the study."""
+WITH_MORE = {"compare": "Compare", "survey": "Survey", "demo": "Demo", "park": "Park"}
+"""Commands of studies that have options besides the fields of the study, in `parkenv.cli.study_commands`."""
 
-KINDS = ("scenario", *STUDIES)
-"""Kinds of files that have a schema."""
+KINDS = ("scenario", *STUDIES)  # kinds of files that have a schema
 
 
 class RunCommand(Command):
@@ -68,8 +64,7 @@ class StudyCommand(RunCommand):
         study, out = command.study, command.out or command.study.folder(given)
         file = out / SPEC_FILE
         if command.resume:
-            if not file.exists():
-                raise InputError(f"--resume: {out} holds no run to resume: no {SPEC_FILE}")
+            ensure(file.exists(), f"--resume: {out} holds no run to resume: no {SPEC_FILE}")
             study = type(study).read(file)
         if "--backend" in given and "--address" not in given:
             # The address belongs to the other backend.
@@ -85,14 +80,6 @@ class StudyCommand(RunCommand):
         self.run_study()
 
     def run_study(self) -> Result:
-        """Run the study, print its result, and write its report on request.
-
-        Raises:
-            InputError: the study cannot be run, or the folder cannot be used.
-            KeyboardInterrupt: the run was interrupted; what is finished is printed and in the folder.
-        """
-        from parkenv.studies.runner import Interrupted, run
-
         console, out = make_console(), self.out or self.study.folder({})
         try:
             with stages(console, self.study.unit) as progress:
@@ -116,7 +103,6 @@ class StudyCommand(RunCommand):
         return make_report(result.folder, self.study)
 
     def show(self, console: Console, result: Result) -> None:
-        """Print the tables of a result, perhaps of an interrupted run, and the findings of a finished one."""
         if result.rows:
             summary = without_nan(result.summary)
             for table in self.study.printed(summary, result.folder):
@@ -126,14 +112,13 @@ class StudyCommand(RunCommand):
 
 
 def study_command(kind: str) -> type[StudyCommand]:
-    """Return the command of a kind of study, whose fields are its options."""
     study = study_class(kind)
-    base: Any = command_class(WITH_MORE[kind]) if kind in WITH_MORE else StudyCommand
+    base: Any = command_class(f"study_commands:{WITH_MORE[kind]}") if kind in WITH_MORE else StudyCommand
     out = option(None, f"Folder for {study.writes}.", short="-o", default=str(study.folder({})))
     trust: Any = {"trust_model": (TrustModel, False)} if "agents" in study.model_fields else {}
     fields: Any = {"study": (study, study()), "out": (Path | None, out)} | trust
     model: Any = create_model(study.__name__, __base__=base, __doc__=study.__doc__, **fields)
-    made = cast(type[StudyCommand], model)
+    made = cast("type[StudyCommand]", model)
     made.examples = study.examples
     return made
 
@@ -157,11 +142,9 @@ class Run(RunCommand, ExecutionSpec):
     out: Path | None = option(None, "Folder for the results.", short="-o", default="results/NAME of the file")
 
     def run(self) -> None:
-        """See `Command`; the folder of a run goes on there."""
         file, out = self.experiment, self.out
         if file.is_dir():
-            if out is not None:
-                raise InputError(f"{file} is the folder of a run, which goes on there; leave out --out")
+            ensure(out is None, f"{file} is the folder of a run, which goes on there; leave out --out")
             file, out = file / SPEC_FILE, file
         study = read_study(file)
         require_trust(study, self.experiment, self.trust)
@@ -186,8 +169,6 @@ class Schema(Command):
     out: Path | None = option(None, "Folder for all schemas, KIND.schema.json.", short="-o", default="none")
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
-
         if self.kind is not None and self.kind not in KINDS:
             raise InputError(f"KIND is {self.kind!r}; {nearest(self.kind, KINDS)}")
         texts = {kind: json.dumps(content, indent=1) for kind, content in schemas().items()}

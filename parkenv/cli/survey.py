@@ -1,4 +1,4 @@
-"""`parkenv survey`, `map-drive` and `map`: map files, from simulated and recorded drives."""
+"""`parkenv map-drive` and `map`: map files, from recorded drives."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from parkenv.cli.options import Command
-from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_console, print_rows, print_table, save_summary, stages
 from parkenv.errors import InputError, nearest
+from parkenv.files.atomic_write import make_folder
+from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import SCENARIO_NAMES, LocaliserName
 from parkenv.files.option import Inside, option
 from parkenv.mapping.photo_options import PhotoOptions
@@ -16,37 +17,11 @@ from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.plurals import plural
 from parkenv.show.report.tables import table_of
 from parkenv.studies.fields import Detector, OneScenario
-from parkenv.studies.sensing.survey_study import COLUMNS, SurveyStudy
+from parkenv.studies.sensing.survey_study import COLUMNS
+from parkenv.world.occupancy.arrival_window import DAY_NAMES
+from parkenv.world.week import DAY_S, HOUR_S
 
-MOST_ROWS = 12
-"""Slots in the table of a map; files have all."""
-
-
-class Survey(StudyCommand):
-    """A survey, which may also record its first session."""
-
-    record: Path | None = option(
-        None,
-        "Also record images, scans and poses of the first session (extra bags), for `parkenv map-drive`.",
-        takes="FILE.mcap",
-        panel="Results",
-        default="none",
-    )
-
-    def run(self) -> None:
-        if self.record is None:
-            self.run_study()
-            return
-        from parkenv.mapping.recorded_drive import record_drive, require_recordable
-
-        require_recordable(self.record)
-        self.run_study()
-        console, study = make_console(), self.study
-        assert isinstance(study, SurveyStudy)
-        with console.status(f"Driving the first session once more for {self.record}"):
-            record_drive(study.survey, 0, self.record)
-        again = f"parkenv map-drive {self.record} --scenario {study.scenario.argument}"
-        console.print(f"Recorded: {self.record}; map it with: {again}")
+MOST_ROWS = 12  # slots in the table of a map; files have all
 
 
 class MapDrive(Command):
@@ -138,14 +113,10 @@ class Map(Command):
     )
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
-        from parkenv.files.csv_tables import write_csv
         from parkenv.mapping.inference import predict
         from parkenv.mapping.store import MapStore
         from parkenv.scenarios.build import build
         from parkenv.show.figures.survey import save_map
-        from parkenv.world.occupancy.arrival_window import DAY_NAMES
-        from parkenv.world.week import DAY_S, HOUR_S
 
         scenario, slot, hour = build(self.scenario), self.slot, self.hour
         lot, ids = scenario.lot, scenario.lot.slot_ids

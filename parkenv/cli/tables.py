@@ -12,6 +12,8 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 from parkenv.files.file_names import is_plain
+from parkenv.show.report.tables import part_of, table_of, written
+from parkenv.studies.results import write_summary
 from parkenv.version import __version__
 
 if TYPE_CHECKING:
@@ -21,11 +23,9 @@ if TYPE_CHECKING:
 
     from parkenv.show.columns import Column
 
-WIDE = 1000
-"""Width assumed if output goes to a file or a pipe, characters: no column of a table is cut there."""
+WIDE = 1000  # width assumed if output goes to a file or a pipe, characters: no column of a table is cut there
 
-MOST_ROWS = 60
-"""Rows of a table that are printed."""
+MOST_ROWS = 60  # rows of a table that are printed
 
 
 def make_console(*, soft_wrap: bool = False) -> Console:
@@ -45,14 +45,12 @@ def make_console(*, soft_wrap: bool = False) -> Console:
 
 
 def _escaped(text: str) -> str:
-    """Return a text with its control characters, except ends of lines, as they are written in Python."""
     return "".join(c if c == "\n" or is_plain(c) else ascii(c)[1:-1] for c in text)
 
 
 def make_table(
     title: str | None, headings: Iterable[str], rows: Iterable[Sequence[str]] = (), texts: int = 1
 ) -> Table:
-    """Make a table of numbers; the first columns, of texts, name the rows."""
     from rich import box
     from rich.table import Table
 
@@ -73,9 +71,6 @@ def print_rows(
     keys: Collection[str] = (),
     columns: Sequence[Column] = (),
 ) -> None:
-    """Print results as a page shows them: some columns, or all."""
-    from parkenv.show.report.tables import part_of, table_of
-
     table = table_of("", title, rows, columns)
     print_table(console, part_of(table, keys) if keys else table)
 
@@ -86,8 +81,6 @@ def print_table(console: Console, table: Mapping[str, Any]) -> None:
     What is equal in all rows, and not 0, stands above the table. A narrow terminal gets several tables, each of which
     begins with the columns that name the rows.
     """
-    from parkenv.show.report.tables import written
-
     rows = table["rows"][:MOST_ROWS]
     equal = [
         f"{column['label']} {written(column, column['value'])} {column.get('unit', '')}".rstrip()
@@ -183,7 +176,6 @@ def _show_compiling(progress: Progress, ended: Event) -> None:
 
 @contextmanager
 def writing_into(out: Path) -> Iterator[None]:
-    """Be the only writer of a folder; say so after an interruption."""
     from parkenv.files.folder_lock import only_writer
 
     try:
@@ -195,13 +187,9 @@ def writing_into(out: Path) -> Iterator[None]:
 
 
 def command_line() -> list[str]:
-    """Return the command as it was given, for summaries."""
     return ["parkenv", *sys.argv[1:]]
 
 
 def save_summary(folder: Path, seed: int | None, rows: Any, **more: Any) -> None:
-    """Write the `summary.json` of a command."""
-    from parkenv.studies.results import write_summary
-
     head = {"command": command_line(), "version": __version__, "seed": seed}
     write_summary(folder, head | more | {"rows": rows})

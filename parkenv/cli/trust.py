@@ -11,6 +11,9 @@ from pydantic import Field
 
 from parkenv.errors import InputError
 from parkenv.files.option import Option
+from parkenv.files.user_class import find_module
+from parkenv.studies.agent_spec import classes_in
+from planners.names import ALGORITHMS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,17 +40,7 @@ TrustModel = Annotated[
 
 
 def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] = ()) -> None:
-    """Refuse a specification that names classes or a cluster, unless the user trusts it; ask in a terminal.
-
-    Args:
-        spec: content of a file or of a run folder.
-        source: the file or folder, for the message.
-        trust: the value of `--trust`.
-        given: fields of the specification that the command line replaces.
-    """
-    from parkenv.files.user_class import find_module
-    from parkenv.studies.agent_spec import classes_in
-
+    """Refuse a specification that names classes or a cluster in fields that are not given; ask in a terminal."""
     classes = classes_in(spec, given)
     named = [f"{name} ({find_module(name) or 'not found'})" for name in classes]
     if "address" not in given and (address := getattr(spec, "address", None)):
@@ -62,13 +55,7 @@ def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] 
 
 
 def readable_models(agents: Sequence[str]) -> list[str]:
-    """Return the agents, with archives of stable-baselines3 converted to model files; this runs the code in them.
-
-    Args:
-        agents: names or `ALGORITHM:FILE`.
-    """
-    from planners.names import ALGORITHMS
-
+    """Return the agents, with archives of stable-baselines3 converted to model files; this runs the code in them."""
     readable = list(agents)
     for i, agent in enumerate(agents):
         algorithm, _, file = agent.partition(":")

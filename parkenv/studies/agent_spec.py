@@ -31,27 +31,19 @@ class AgentSpec(Spec):
 
     @classmethod
     def of(cls, text: str) -> AgentSpec:
-        """Parse an agent from text such as `mdp(failure_s=90)`."""
         return cls.parse(parse_call(text), "--agent")
 
     @property
     def options(self) -> dict[str, Any]:
-        """The options by name."""
         return dict(self.model_extra or {})
 
     @property
     def label(self) -> str:
-        """Text of the agent in tables and on command lines: `mdp(failure_s=90)`."""
         return label_of(self.name, self.options)
 
 
 def label_of(name: str, options: dict[str, Any]) -> str:
-    """Format an agent with its options, such as `mdp(failure_s=90)`.
-
-    Examples:
-        >>> label_of("belief", {"budget_ms": 2.0})
-        'belief(budget_ms=2)'
-    """
+    """Format an agent with its options, such as `mdp(failure_s=90)`."""
     if not options:
         return name
     return f"{name}({','.join(f'{option}={_text(value)}' for option, value in options.items())})"
@@ -81,12 +73,7 @@ def split_agents(text: str) -> list[str]:
 
 
 def classes_in(spec: Spec, without: Collection[str] = ()) -> list[str]:
-    """Return the classes `MODULE:CLASS` that a specification names: agents, detectors and worlds of a user's own.
-
-    Args:
-        spec: the specification.
-        without: fields to leave out.
-    """
+    """Return the classes `MODULE:CLASS` of a user's own that the fields name: agents, detectors and worlds."""
     classes: list[str] = []
     for field in (name for name in type(spec).model_fields if name not in without):
         value = getattr(spec, field)

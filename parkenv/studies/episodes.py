@@ -31,8 +31,6 @@ class SearchRecorder(Observer):
         self._preview_of, self._steps = getattr(agent, "plan_preview", None), steps
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Record the arrival."""
-        del observation
         self._env: Any = env.unwrapped
         self.policy: NDArray[np.int64] | None = (
             None  # of the first decision; None for agents without a policy
@@ -42,7 +40,6 @@ class SearchRecorder(Observer):
         self._record()
 
     def on_step(self, step: Step) -> None:
-        """Record the decision, the plan that led to it, and the next state."""
         if not self._decided:
             self.policy = getattr(step.memory, "policy", None)
         self._decided = True
@@ -66,16 +63,12 @@ class TripRecorder(Observer):
     """
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Begin a trip."""
-        del env, observation
         self.observations: list[Observations] = []
 
     def on_step(self, step: Step) -> None:
-        """Add what the step observed."""
         self.observations.append(SlotBelief.of_observation(step.next_observation).observations)
 
     def trip(self, key: str, time: float, date: str) -> Trip:
-        """Return the recorded trip; the arguments are those of `Trip`."""
         return Trip(
             key, time, date, *(np.concatenate(parts) for parts in zip(*self.observations, strict=True))
         )
@@ -111,18 +104,11 @@ class EpisodeRunner:
         self._routes = DriveRoutes(scenario)
 
     def bound_s(self, seed: int) -> float:
-        """Return the clairvoyant lower bound of the total time, s, in the world of `seed`."""
         self.env.reset(seed=seed)
         return self._bound_s()
 
     def run(self, seed: int, observers: Sequence[Observer] = (), *, moments: bool = False) -> SearchRecord:
-        """Run one search in the world of `seed`.
-
-        Args:
-            seed: seed of the world.
-            observers: further observers.
-            moments: whether the record holds each step.
-        """
+        """Run one search in the world of `seed`; with `moments`, the record holds each step."""
         recorder = SearchRecorder(self.agent, steps=moments)
         result = simulate(self.env, self.agent, seed, (recorder, *observers))
         metrics = {
@@ -160,7 +146,6 @@ class EpisodeRunner:
 
     @property
     def occupancy(self) -> float:
-        """Share of the slots that are taken at the arrival of the present episode."""
         return float(self._occupied().mean())
 
     def _occupied(self) -> BoolArray:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema
 
-from parkenv.errors import InputError
+from parkenv.errors import ensure
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import SCENARIO_NAMES, RigName
 from parkenv.files.limited_reading import is_there
@@ -29,7 +29,6 @@ T = TypeVar("T")
 
 
 def _scenario_tables(value: object, info: ValidationInfo) -> object:
-    """Resolve the name of a packaged scenario, or a file relative to the one that names it."""
     if not isinstance(value, str | Path):
         return value
     folder = (info.context or {}).get("folder", Path())
@@ -41,7 +40,6 @@ ScenarioItem = Annotated[ScenarioSpec, BeforeValidator(_scenario_tables), OrText
 
 
 def _with_folders(value: object, info: ValidationInfo) -> object:
-    """Replace folders in a list of scenarios by the scenarios in them."""
     if not isinstance(value, list | tuple):
         return value
     folder = Path((info.context or {}).get("folder", Path()))
@@ -74,16 +72,13 @@ def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...
 
 def _one_car_park(scenario: ScenarioSpec) -> ScenarioSpec:
     scenarios = _by_car_park((scenario,))
-    if len(scenarios) > 1:
-        raise InputError(f"--car-park names {len(scenarios)} scenarios, want one")
+    ensure(len(scenarios) <= 1, f"--car-park names {len(scenarios)} scenarios, want one")
     return scenarios[0]
 
 
 def one_word(text: str) -> str:
-    """Return the name of the one scenario of an option."""
     words = words_in(text)
-    if len(words) > 1:
-        raise InputError(f"names {len(words)} scenarios, want one")
+    ensure(len(words) <= 1, f"names {len(words)} scenarios, want one")
     return words[0]
 
 
@@ -109,7 +104,6 @@ ScenarioList = Annotated[
     AfterValidator(_by_car_park),
     Field(min_length=1, max_length=1_000, description=SCENARIOS_HELP),
 ]
-"""Scenarios in a file: names, files, folders of scenario and lot files, or inline tables."""
 SCENARIOS_TAKE = "NAME|FILE|DIR[,...]"
 Scenarios = Annotated[
     ScenarioList,
@@ -117,7 +111,6 @@ Scenarios = Annotated[
     Option("--lot", takes="NAME|FILE[,...]", panel="World", parse=_lots, description=_LOT_ALONE),
     Inside(without=TRAFFIC),
 ]
-"""The scenarios of a study."""
 OneScenario = Annotated[
     ScenarioItem,
     AfterValidator(_one_car_park),
@@ -131,7 +124,6 @@ OneScenario = Annotated[
         description=_LOT_ALONE,
     ),
 ]
-"""The one scenario of a file."""
 AGENTS_HELP = (
     f"Agents, with any options in brackets, mdp(failure_s=90): {', '.join(AGENTS)}; ALGORITHM:FILE for a trained "
     "model; human:FILE for the scores of a game; MODULE:CLASS for your own."
@@ -141,13 +133,11 @@ Agents = Annotated[
     Field(min_length=1, max_length=1_000, description=AGENTS_HELP),
     Option(takes="NAME[,...]", parse=split_agents),
 ]
-"""Agents in a file: names, or tables with a name and options."""
 
 
 def _one_agent(text: str) -> str:
     names = split_agents(text)
-    if len(names) != 1:
-        raise InputError(f"names {len(names)} agents, want one")
+    ensure(len(names) == 1, f"names {len(names)} agents, want one")
     return names[0]
 
 
@@ -156,7 +146,6 @@ OneAgent = Annotated[
     Field(description="The agent that searches, with any options in brackets: mdp(failure_s=90)."),
     Option("--agents", takes="NAME", parse=_one_agent),
 ]
-"""The one agent of a file."""
 Seed = Annotated[int, Field(ge=0, lt=2**31, description="First seed; episode i uses seed + i."), Option()]
 
 
@@ -174,12 +163,10 @@ Vehicle = Annotated[
     WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]}),
     Field(description="The car: golf, tpcap, parkbench, a file (.toml, .json), or a table."),
     Option(takes="NAME|FILE", parse=str, default="golf, or that of a scene"),
-]
-"""A `VehicleParameters`, or None for the default."""
+]  # A `VehicleParameters`, or None for the default
 
 
 def listed(value: object) -> object:
-    """Make a single value a list of one."""
     return value if isinstance(value, list | tuple) else [value]
 
 
@@ -194,7 +181,6 @@ Rig = Annotated[
     ),
     Option(panel="Sensors"),
 ]
-"""Simulated sensors that observe the slots."""
 Detector = Annotated[
     DetectorName | None,
     Field(
@@ -232,8 +218,7 @@ Patience = Annotated[
         "the drive to the goal does not count.",
     ),
 ]
-BUSY = TrafficSpec(cars=3, pedestrians=5)
-"""Default traffic of runs with simulated sensors."""
+BUSY = TrafficSpec(cars=3, pedestrians=5)  # default traffic of runs with simulated sensors
 
 
 def with_traffic(scenario: ScenarioSpec) -> ScenarioSpec:
@@ -241,12 +226,10 @@ def with_traffic(scenario: ScenarioSpec) -> ScenarioSpec:
     return scenario if scenario.traffic else scenario.changed(traffic=BUSY)
 
 
-CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
-"Distance between captures, m."
+CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]  # distance between captures, m
 
 
 def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[ScenarioSpec, ...] = ()) -> None:
-    """Check that no two agents, and no two scenarios, share a name."""
     for what, names in (
         ("agents", [agent.label for agent in agents]),
         ("scenarios", [scenario.title for scenario in scenarios]),
@@ -260,5 +243,4 @@ def require_at_most(count: int, what: str, unit: str, most: int = MAX_EPISODES) 
 
 
 def require_rig(rig: str | None, detector: str | None) -> None:
-    """Check that a detector has images."""
     require(detector is None or rig is not None, "detector requires a rig, such as laser")

@@ -11,14 +11,13 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from parkenv.compiled.keyed_random import world_key
-from parkenv.errors import InputError
+from parkenv.errors import ensure
 from parkenv.show.report.page import terms_data
 from parkenv.show.scene import LotScene
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, require_distinct
-from parkenv.studies.report import AGREES_S, MOST_SLOTS
 from parkenv.studies.simulate import STEP_LIMIT, Observer, Step
-from parkenv.studies.study import Progress
+from parkenv.studies.study import AGREES_S, MOST_SLOTS, Progress
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
 
@@ -43,8 +42,7 @@ def game_data(
     What decides the cost of a search is written as float64, so that the page's search equals `parkenv/Search-v2`.
     """
     lot, actions_s = scenario.lot, scenario.edges["seconds"]
-    if lot.n_slots > MOST_SLOTS:
-        raise InputError(f"{scenario.name} has {lot.n_slots} slots, want at most {MOST_SLOTS}")
+    ensure(lot.n_slots <= MOST_SLOTS, f"{scenario.name} has {lot.n_slots} slots, want at most {MOST_SLOTS}")
     cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
     require_distinct(cases)
     runners, worlds = [case.runner() for case in cases], list[dict[str, Any]]()
@@ -110,13 +108,13 @@ def require_same_worlds(case: Case, seeds: Sequence[int]) -> None:
     runner = case.runner()
     played: dict[int, float] = runner.agent.totals  # type: ignore[attr-defined]
     for seed in seeds:
-        if seed not in played:
-            raise InputError(
-                f"{case.agent} has no world of seed {seed}, want --seed {min(played)} and --episodes {len(played)}"
-            )
+        ensure(
+            seed in played,
+            f"{case.agent} has no world of seed {seed}, want --seed {min(played)} and --episodes {len(played)}",
+        )
         total_s = float(runner.run(seed).metrics["total_s"])
-        if abs(total_s - played[seed]) > AGREES_S:
-            raise InputError(
-                f"{case.agent}: total_s is {played[seed]:.6f}, want {total_s:.6f}, which the actions of seed {seed} "
-                f"take in {case.scenario.name} here: the game had other worlds or costs"
-            )
+        ensure(
+            abs(total_s - played[seed]) <= AGREES_S,
+            f"{case.agent}: total_s is {played[seed]:.6f}, want {total_s:.6f}, which the actions of seed {seed} "
+            f"take in {case.scenario.name} here: the game had other worlds or costs",
+        )

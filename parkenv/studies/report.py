@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from pydantic import Field
 
@@ -15,31 +15,20 @@ from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.show.report.page import Page, page_data, write_page
 from parkenv.show.report.tables import tables_of
-from parkenv.studies.fingerprints import require_unchanged
-from parkenv.studies.report_options import NotInRunError, ReportOptions
-from parkenv.studies.results import PAGE, SETTINGS, SPEC_FILE, SUMMARY, SUMMARY_PARTIAL
-from parkenv.studies.study import STUDIES, Progress, Study, read_study, study_class
-from parkenv.studies.workers import SERIAL, Task, Workers
+from parkenv.studies.results import PAGE, SETTINGS, SPEC_FILE, SUMMARY, SUMMARY_PARTIAL, require_unchanged
+from parkenv.studies.study import (
+    STUDIES,
+    NotInRunError,
+    Progress,
+    Recording,
+    ReplayJob,
+    ReportOptions,
+    Study,
+    read_study,
+    study_class,
+)
+from parkenv.studies.workers import SERIAL, Workers
 from parkenv.version import __version__
-
-MOST_SLOTS = 20_000
-"""Lots with more slots are not replayed: the page would not load."""
-AGREES_S = 1e-6
-"""Total times of a search or a day that differ by less agree, s."""
-Recording = dict[str, Any]
-"""Searches in a world, a drive or a day in the data of a page; its `differences` from the run are notes."""
-
-
-class ReplayJob(NamedTuple):
-    """Searches, drives or days to run again for a page.
-
-    Attributes:
-        tasks: each returns a recording.
-        notes: what is left out, and why.
-    """
-
-    tasks: Sequence[Task[Recording]] = ()
-    notes: Sequence[str] = ()
 
 
 class Summary(Spec, extra="allow"):
@@ -102,17 +91,18 @@ class RunFolder:
             raise InputError(f"{damaged}: {error!r}") from error
 
     def spec(self) -> Study | None:
-        """Read the specification that the run kept; None for a command that keeps none."""
         return read_study(self.path / SPEC_FILE) if self.kind in STUDIES else None
 
     @property
     def command(self) -> list[str]:
-        """The words of a command that repeats the run in a folder beside it; its own if it may replace the run."""
+        """The words of a command that repeats the run in a folder beside it."""
         words = [
             str(self.path / SPEC_FILE) if word == SPEC_FILE else str(word) for word in self.summary["command"]
         ]
-        if self.kind not in STUDIES or {"--resume", "--overwrite"} & set(words):
+        if self.kind not in STUDIES:
             return words
+        if {"--resume", "--overwrite"} & set(words):
+            words = ["parkenv", "run", str(self.path / SPEC_FILE)]
         out, path = ("--out", "-o"), self.path if self.path.name else self.path.resolve()
         pairs = zip(words, ["", *words], strict=False)
         others = [w for w, before in pairs if not {w, before} & {*out} and not w.startswith("--out=")]
@@ -123,7 +113,6 @@ class RunFolder:
         return sorted(self.path.glob("*.png"))
 
     def data(self, recordings: Sequence[Recording] = (), notes: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the data of the run's page; see `page_data`."""
         return page_data(self.kind, self.page, {**self.summary, "command": self.command}, recordings, notes)
 
 

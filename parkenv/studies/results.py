@@ -1,4 +1,4 @@
-"""Finished rows of a run: in one SQLite file in its folder, so that they survive a crash.
+"""Finished rows of a run, in one SQLite file in its folder, so that they survive a crash; and what they depend on.
 
 `settings.json` holds the settings. Every finished row goes into `results.sqlite`. The tables, such as `episodes.csv` or
 `days.csv`, are written from there at the end of a run and when it is interrupted; `summary.json` is written at the end.
@@ -6,19 +6,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, ensure
 from parkenv.files.atomic_write import make_folder, write_text
 from parkenv.files.csv_tables import csv_columns, csv_text, write_csv
 from parkenv.files.limited_reading import parse_json, read_json
 from parkenv.files.row_file import RowFile, to_json
+from parkenv.files.spec_file import Spec
 from parkenv.show.columns import SETTING_AXES
 from parkenv.studies.workers import SERIAL
+from parkenv.version import __version__
 from parkenv.world.cost_terms import COST_FIELDS
 
 if TYPE_CHECKING:
@@ -29,8 +32,7 @@ Row = dict[str, Any]
 Key = tuple[Any, ...]
 
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", *SETTING_AXES)
-KEY_COLUMNS = (*SETTING_COLUMNS, "seed")
-"""Columns that identify an episode of a comparison."""
+KEY_COLUMNS = (*SETTING_COLUMNS, "seed")  # columns that identify an episode of a comparison
 OUTCOME_COLUMNS = (
     "day",
     "arrival_s",
@@ -48,11 +50,8 @@ OUTCOME_COLUMNS = (
     "replans",
     "steps",
 )
-"""Columns of an episode's outcome."""
-DECISIONS = "decisions_us"
-"""Column of the wall times of an episode's decisions, µs."""
-SPEC_FILE = "experiment.json"
-"""File in a run folder with the specification of its study."""
+DECISIONS = "decisions_us"  # column of the wall times of an episode's decisions, µs
+SPEC_FILE = "experiment.json"  # file in a run folder with the specification of its study
 SETTINGS = "settings.json"
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
@@ -68,9 +67,9 @@ class Table:
         file: name of the file: a CSV table; or `.jsonl` for whole rows, a JSON object in each line.
         keys: columns that identify a row.
         columns: the other columns of the file.
-        long: whether a row has many lines of the file: each of `columns` is a list with a value for each of them.
         lists: name of a second file, and its columns, which hold a list for each row as a text, such as the wall times
             of decisions; None for none.
+        long: whether a row has many lines of the file: each of `columns` is a list with a value for each of them.
     """
 
     file: str
@@ -80,20 +79,16 @@ class Table:
     lists: tuple[str, Sequence[str]] | None = None
 
     def key(self, row: Mapping[str, Any]) -> Key:
-        """Return the key of a row."""
         return tuple(row[c] for c in self.keys)
 
     @property
     def files(self) -> list[str]:
-        """Names of its files."""
         return [self.file, *(self.lists or ())[:1]]
 
     def read(self, folder: Path) -> list[Row]:
-        """Read the rows of the run in a folder; none if it holds none."""
         return list(_stored(folder, [self])[self.file].values())
 
     def write(self, folder: Path, rows: Sequence[Row]) -> None:
-        """Write its files."""
         names = (*self.keys, *self.columns)
         if self.file.endswith(".jsonl"):
             write_text(folder / self.file, "".join(to_json(row) + "\n" for row in rows))
@@ -123,7 +118,6 @@ def _store(folder: Path, *, create: bool) -> RowFile:
 
 
 def _stored(folder: Path, tables: Sequence[Table]) -> dict[str, dict[Key, Row]]:
-    """Return the rows of the run in a folder, by table and key; none if it holds none."""
     if not (folder / STORE).exists():
         return {table.file: {} for table in tables}
     try:
@@ -139,7 +133,6 @@ def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY)
 
 
 def read_settings(folder: Path) -> Row | None:
-    """Read the settings of the run in a folder; return None if there is no run."""
     file = folder / SETTINGS
     if not file.exists():
         return None
@@ -150,49 +143,37 @@ def read_settings(folder: Path) -> Row | None:
 
 
 def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) -> Row:
-    """Check that a run to resume has the same settings.
+    """Check that a run to resume has the same settings, and return the merged ones; new values take precedence.
 
     Mappings, such as the files of agents, need to agree only in the names that both have.
-
-    Args:
-        folder: folder of the run.
-        settings: the current settings.
-        kind: kind of run.
-
-    Returns:
-        The merged settings; new values take precedence.
     """
     before = read_settings(folder)
     if before is None:
         raise InputError(f"--resume: {folder} holds no {kind} run to resume")
     now = parse_json(json.dumps(dict(settings)), "settings")
-    both = {}
+    merged: Row = {}
     for name in sorted(before.keys() | now.keys()):
         old, new = before.get(name), now.get(name)
-        both[name] = {**old, **new} if isinstance(old, dict) and isinstance(new, dict) else new
-        for part, was, wanted in _parts(name, old, new):
+        pairs = [(name, old, new)]
+        merged[name] = new
+        if isinstance(old, dict) and isinstance(new, dict):
+            merged[name] = {**old, **new}
+            pairs = [(f"{name}: {key}", old[key], new[key]) for key in sorted(old.keys() & new.keys())]
+        for part, was, wanted in pairs:
             if was != wanted:
-                raise InputError(
-                    f"--resume: {part:.300} was {was!r:.200} in {folder}, now it is {wanted!r:.200}; "
-                    "use the same settings, or another folder"
-                )
-    return both
+                _refuse(folder, part, was, wanted)
+    return merged
 
 
-def _parts(name: str, old: Any, new: Any) -> list[tuple[str, Any, Any]]:
-    """Pair an old and a new setting: mappings by the names that both have, nested mappings by all names."""
-    if not (isinstance(old, dict) and isinstance(new, dict)):
-        return [(name, old, new)]
-    parts: list[tuple[str, Any, Any]] = []
-    for key in sorted(old.keys() & new.keys()):
-        was, now = old[key], new[key]
-        if isinstance(was, dict) and isinstance(now, dict):
-            parts += [
-                (f"{key}.{part}", was.get(part), now.get(part)) for part in sorted(was.keys() | now.keys())
-            ]
-        else:
-            parts.append((f"{name}: {key}", was, now))
-    return parts
+def _refuse(folder: Path, part: str, was: Any, wanted: Any) -> None:
+    """Raise an error that names the first difference of two settings, which may be tables."""
+    if isinstance(was, dict) and isinstance(wanted, dict):
+        key = next(key for key in sorted(was | wanted) if was.get(key) != wanted.get(key))
+        part, was, wanted = f"{part}.{key}", was.get(key), wanted.get(key)
+    raise InputError(
+        f"--resume: {part:.300} was {was!r:.200} in {folder}, now it is {wanted!r:.200}; "
+        "use the same settings, or another folder"
+    )
 
 
 class Results:
@@ -220,13 +201,11 @@ class Results:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the store; the rows stay in memory."""
         if self._store is not None:
             self._store.close()
             self._store = None
 
     def read(self) -> None:
-        """Read the rows that the folder holds."""
         self._rows = _stored(self.path, self._tables)
 
     def claim(
@@ -237,14 +216,6 @@ class Results:
         resume: bool = False,
         overwrite: bool = False,
     ) -> Row:
-        """Check that a run may use the folder, and read what it goes on with; return the settings for `begin`.
-
-        Args:
-            settings: settings of the run; everything that affects a row.
-            kind: kind of run, for messages.
-            resume: continue an earlier run with the same settings.
-            overwrite: replace the results of another run.
-        """
         make_folder(self.path)
         if resume:
             settings = require_same_settings(self.path, settings, kind)
@@ -257,15 +228,7 @@ class Results:
             )
         return dict(settings)
 
-    def recorded_command(self) -> tuple[str, ...]:
-        """Return the command of the run that the folder holds; empty if it is lost."""
-        for file in (self.path / SUMMARY, self.path / SUMMARY_PARTIAL):
-            if file.exists() and isinstance(summary := read_json(file), dict):
-                return tuple(map(str, summary.get("command", ())))
-        return ()
-
     def begin(self, settings: Mapping[str, Any], *, continues: bool) -> None:
-        """Write the settings of the run, and open the store, an empty one unless the run goes on with another."""
         old = [SUMMARY, *(file for table in self._tables for file in table.files)]
         for name in (
             old if continues else [*old, *(f"{STORE}{ending}" for ending in ("", "-wal", "-journal"))]
@@ -276,16 +239,16 @@ class Results:
         self._store = _store(self.path, create=True)
 
     def rows(self, table: Table = EPISODES) -> Mapping[Key, Row]:
-        """Return the finished rows of a table, by key."""
         return self._rows[table.file]
 
     def of(self, study: Study, cell: Cell) -> list[Row]:
-        """Return the finished rows of a cell, in the order of its items."""
         rows = self.rows(study.table)
         return [rows[key] for item in cell.items for key in study.keys(cell.work, item) if key in rows]
 
+    def all_of(self, study: Study) -> list[Row]:
+        return [row for cell in study.cells() for row in self.of(study, cell)]
+
     def replace(self, rows: Iterable[Row], table: Table) -> None:
-        """Store these rows of a table instead of those that it has."""
         self._rows[table.file] = {table.key(row): row for row in rows}
         if self._store is not None:
             new = ((table.file, key, row) for key, row in self._rows[table.file].items())
@@ -316,23 +279,19 @@ class Results:
                 self.replace([rows[key] for key in wanted], table)
 
     def export(self) -> None:
-        """Write the files of all tables."""
         for table in self._tables:
             table.write(self.path, list(self._rows[table.file].values()))
 
     def finish(self, summary: Mapping[str, Any], *, complete: bool = True) -> None:
-        """Write the summary; that of an incomplete run is called `summary.partial.json`."""
         (self.path / SUMMARY_PARTIAL).unlink(missing_ok=True)
         write_summary(self.path, summary, SUMMARY if complete else SUMMARY_PARTIAL)
 
 
 def decision_s(row: Mapping[str, Any]) -> list[float]:
-    """Return the wall times of an episode's decisions, s."""
     return [int(us) * 1e-6 for us in row[DECISIONS].split()]
 
 
 def timed_row(record: SearchRecord) -> Row:
-    """Return the row of a search with the wall times of its decisions."""
     return record.row | {DECISIONS: " ".join(str(round(1e6 * s)) for s in record.decision_s)}
 
 
@@ -345,3 +304,51 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, float) and value != value:
         return None
     return value
+
+
+def search_settings(spec: Any, *fields: str) -> Row:
+    """Return the settings of a study whose agents search, with further fields that a resumed run must share."""
+    scenarios = spec.scenarios if hasattr(spec, "scenarios") else (spec.scenario,)
+    agents = (spec.agents or ()) if hasattr(spec, "agents") else (spec.agent,)
+    detector = getattr(spec, "detector", None)
+    versions = {}
+    if detector is not None:
+        from parkenv.perception.detector_registry import detector_version
+
+        versions = {"detector": detector_version(detector)}
+    return {
+        "version": __version__,
+        "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in scenarios},
+        "files": fingerprints(spec.files()),
+        "agent files": agent_fingerprints(agent.name for agent in agents),
+        **{name: getattr(spec, name) for name in fields},
+        **versions,
+    }
+
+
+def flat_tables(tables: Mapping[str, Any], before: str = "") -> Row:
+    """Flatten nested tables into one with dotted keys, such as `costs.failure_s`."""
+    flat: Row = {}
+    for key, value in tables.items():
+        flat |= (
+            flat_tables(value, f"{before}{key}.") if isinstance(value, Mapping) else {f"{before}{key}": value}
+        )
+    return flat
+
+
+def fingerprints(files: Iterable[Path]) -> dict[str, str]:
+    """Return a short hash of each file's content, by path, so that a resumed run detects changed files."""
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in files}
+
+
+def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
+    from planners.agent import agent_file
+
+    files = {name: agent_file(name) for name in dict.fromkeys(names)}
+    return {name: fingerprints([file])[str(file)] for name, file in files.items() if file is not None}
+
+
+def require_unchanged(spec: Spec, folder: Path) -> None:
+    before = (read_settings(folder) or {}).get("files", {})
+    for path, now in fingerprints(spec.files()).items():
+        ensure(before.get(path) in (None, now), f"{path} has changed since the run")

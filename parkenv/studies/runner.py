@@ -11,22 +11,21 @@ import shutil
 import warnings
 import weakref
 from collections.abc import Collection, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 from uuid import uuid4
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, ensure
 from parkenv.files.folder_lock import only_writer
 from parkenv.files.limited_reading import read_json
 from parkenv.files.user_class import failure_of
 from parkenv.studies.agent_spec import classes_in
 from parkenv.studies.results import SETTINGS, SPEC_FILE, SUMMARY, Key, Results, Row
-from parkenv.studies.study import ExecutionSpec, Progress, Stage, Study, read_study, run_tasks
+from parkenv.studies.study import Progress, Stage, Study, read_study, run_tasks
 from parkenv.studies.workers import Workers
 from parkenv.version import __version__
 
@@ -60,18 +59,6 @@ class Result:
     def complete(self) -> bool:
         """Whether everything is finished."""
         return bool(self.summary["complete"])
-
-    def frame(self) -> Any:
-        """Return `rows` as a pandas `DataFrame`.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
-        try:
-            pandas = import_module("pandas")
-        except ImportError as error:
-            raise InputError("frame() needs pandas: pip install pandas") from error
-        return pandas.DataFrame(self.rows)
 
     def figures(self) -> list[Path]:
         """Draw all figures into the folder; return the PNG files there."""
@@ -128,7 +115,6 @@ def run(
         progress: called as rows finish; see `Progress`.
         workers: where tasks run, if not as the study says; results do not depend on it.
         command: command line to record in the summary; by default the one that runs the specification in the folder.
-            A run that is resumed with the same specification keeps its first one.
 
     Raises:
         InputError: the study cannot be run, or the folder cannot be used.
@@ -161,12 +147,6 @@ def run(
         results.workers, results.progress = used, progress
         results.command = tuple(command or ("parkenv", "run", SPEC_FILE))
         settings = results.claim(study.settings(), study.kind, resume=resume, overwrite=overwrite)
-        if resume and (path / SPEC_FILE).exists():
-            machines = {name: getattr(study, name) for name in ExecutionSpec.model_fields}
-            # A file that is damaged, or another study's, is written anew.
-            with suppress(InputError):
-                if type(study).read(path / SPEC_FILE).changed(**machines) == study:
-                    results.command = results.recorded_command() or results.command
         study.prepare(results, continues=resume)
         results.begin(settings, continues=resume)
         study.write(path / SPEC_FILE)
@@ -204,8 +184,7 @@ def open_run(folder: Path | str) -> Result:
     """
     path = Path(folder)
     for name in (SPEC_FILE, SETTINGS, SUMMARY):
-        if not (path / name).exists():
-            raise InputError(f"{path}: holds no finished run: no {name}")
+        ensure((path / name).exists(), f"{path}: holds no finished run: no {name}")
     study = read_study(path / SPEC_FILE)
     results = Results(path, (study.table, *study.further_tables))
     results.read()
@@ -213,7 +192,6 @@ def open_run(folder: Path | str) -> Result:
 
 
 def _put_in_order(stages: Sequence[Stage], results: Results) -> None:
-    """Put all tables in the order of the cells: of each study, and then of its stages."""
     cells = [(study, study.cells()) for study in {id(stage.study): stage.study for stage in stages}.values()]
     order: dict[tuple[str, ...], list[Key]] = {}
     for study, of_study in [*cells, *((stage.study, stage.cells) for stage in stages)]:
@@ -232,31 +210,27 @@ def _draw(result: Result, progress: Progress) -> None:
 def _run_stage(
     stage: Stage, results: Results, workers: Workers, progress: Progress, told: Collection[str] = ()
 ) -> None:
-    """Run what the results do not hold yet, and add it; warnings that the user has been told are not repeated.
-
-    Raises:
-        KeyboardInterrupt: passed on; finished rows are in the folder.
-    """
+    """Run what the results do not hold yet, and add it; warnings that the user has been told are not repeated."""
     doing, study, cells = stage
     finished = results.rows(study.table)
-    first: list[tuple[Any, Sequence[Any]]] = []
-    blocks = list(first)
-    total = missing = 0
+    # The number of a block within its cell, the cell's work and the items.
+    numbered: list[tuple[int, Any, Sequence[Any]]] = []
+    total = done = 0
     for work, items in cells:
         left = []
         for item in items:
             keys = study.keys(work, item)
             total += len(keys)
-            if any(key not in finished for key in keys):
-                missing += len(keys)
+            if all(key in finished for key in keys):
+                done += len(keys)
+            else:
                 left.append(item)
-        of_cell = [(work, left[i : i + study.block]) for i in range(0, len(left), study.block)]
+        starts = range(0, len(left), study.block)
+        numbered += [(n, work, left[i : i + study.block]) for n, i in enumerate(starts)]
+    if not workers.in_process:
         # One block of each cell first: workers then compile the functions of different agents at the same time.
-        n_first = 0 if workers.in_process else 1
-        first += of_cell[:n_first]
-        blocks += of_cell[n_first:]
-    blocks = first + blocks
-    done = total - missing
+        numbered.sort(key=lambda block: block[0] > 0)
+    blocks = [(work, items) for _, work, items in numbered]
     progress(doing, done, total)
     token = "" if workers.in_process else uuid4().hex
     tasks = [partial(_run_block, token, study, work, block) for work, block in blocks]

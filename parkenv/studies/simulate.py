@@ -44,7 +44,6 @@ class EpisodeResult:
 
     @property
     def steps(self) -> int:
-        """Number of decisions."""
         return len(self.decision_s)
 
 
@@ -76,13 +75,10 @@ class FrameRecorder(Observer):
         self.frames: list[Any] = []
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Render the start."""
-        del observation
         self._env, self._steps = env, 0
         self.frames.append(env.render())
 
     def on_step(self, step: Step) -> None:
-        """Render the step, if it is its turn or the last one."""
         self._steps += 1
         if step.terminated or step.truncated or self._steps % self._every == 0:
             self.frames.append(self._env.render())
@@ -100,7 +96,9 @@ def simulate(
         observers: called in this order at each hook.
     """
     observation, _ = env.reset(seed=seed)
-    _prepare(agent, env)
+    if isinstance(agent, ClairvoyantAgent):
+        state = env.unwrapped.state  # type: ignore[attr-defined]
+        agent.prepare(state.world, state.time)
     for observer in observers:
         observer.on_reset(env, observation)
     memory: Any = None
@@ -129,50 +127,29 @@ def simulate(
 
 
 def charge_truncation(metrics: MutableMapping[str, Any], give_up_s: Any, truncated: Any = 1.0) -> None:
-    """Charge truncated searches the give-up penalty, like searches that give up in a full lot.
+    """Add the give-up penalty to the metrics of truncated searches: an agent that never parks would seem cheap.
 
-    Otherwise an agent that never parks would seem cheap.
-
-    Args:
-        metrics: metrics of a search, or arrays with one element per search; `gave_up_s` and `total_s` are increased.
-        give_up_s: the penalty of the scenario, or of each search's, s.
-        truncated: which searches were truncated, as a number or a bool array.
+    All arguments are of one search, or arrays with one element per search.
     """
-    penalty = truncated * give_up_s
-    metrics["gave_up_s"] = metrics["gave_up_s"] + penalty
-    metrics["total_s"] = metrics["total_s"] + penalty
+    for name in ("gave_up_s", "total_s"):
+        metrics[name] = metrics[name] + truncated * give_up_s
 
 
 def make_search(
     scenario: Scenario, agent: Agent, rig: str | None = None, **options: Any
 ) -> gym.Env[Any, Any]:
-    """Make the environment that gives an agent what it observes.
+    """Make `parkenv/Search-v2`, or with a rig `parkenv/SearchPerception-v2`, as the agent observes it.
 
-    It is `parkenv/Search-v2`, or with a rig `parkenv/SearchPerception-v2`; equal seeds give equal worlds in both.
-
-    Args:
-        scenario: the scenario.
-        agent: the agent.
-        rig: sensor rig of the car, by name.
-        options: further arguments of `gymnasium.make`.
+    Equal seeds give equal worlds in both.
     """
     name = "parkenv/Search-v2" if rig is None else "parkenv/SearchPerception-v2"
-    if rig is not None:
-        options["rig"] = rig
+    options |= {} if rig is None else {"rig": rig}
     # The environments are checked by their tests; checking each again takes as long as some searches.
     env = gym.make(name, disable_env_checker=True, scenario=scenario, **options)
     return adapt_to_agent(env, agent)
 
 
 def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
-    """Give the environment the agent's observation: trained models use `LocalObservation`."""
     k = getattr(agent, "local_k", None)
     is_local = "local" in getattr(env.observation_space, "spaces", ())
     return env if k is None or is_local else LocalObservation(env, k)
-
-
-def _prepare(agent: Agent, env: gym.Env[Any, Any]) -> None:
-    """Pass the hidden occupancy to agents that know it by definition, such as the oracle."""
-    if isinstance(agent, ClairvoyantAgent):
-        state = env.unwrapped.state  # type: ignore[attr-defined]
-        agent.prepare(state.world, state.time)

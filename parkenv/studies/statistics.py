@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -14,24 +14,15 @@ from parkenv.world.cost_terms import COST_FIELDS
 RESAMPLES = 9999
 LEAST_PAIRS = 6
 """Fewest paired searches that can show a difference at 95 %: with five, all of one sign come up once in 16."""
-_ROUNDING = 1e-12
-"""Relative difference of values that count as the same."""
+_ROUNDING = 1e-12  # relative difference of values that count as the same
 
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float, float]:
     """Compute the mean and bootstrap interval (bias-corrected and accelerated) of a sample.
 
-    Args:
-        values: (n,) numbers.
-        confidence: coverage of the interval.
-
     Returns:
         Mean, lower and upper end. The ends equal the mean if all values are the same but for rounding, and are NaN for
         fewer than two values. The resampling has a fixed seed: equal samples have equal intervals.
-
-    Examples:
-        >>> mean_interval([1.0, 1.0, 1.0])
-        (1.0, 1.0, 1.0)
     """
     sample = np.asarray(values, dtype=np.float64)
     if len(sample) == 0:
@@ -55,55 +46,48 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
 
 
 def mean_or_nan(values: NDArray[Any]) -> float:
-    """Return the mean; NaN of no values."""
     return float(values.mean()) if len(values) else float("nan")
 
 
 def trimmed_mean_interval(values: ArrayLike, cut: float) -> tuple[float, float, float]:
-    """Compute a trimmed mean and its 95 % bootstrap interval (percentiles).
-
-    Args:
-        values: (n,) numbers, n >= 1.
-        cut: share of the numbers that is left out at either end, rounded down.
-
-    Returns:
-        Mean, lower and upper end. The ends are NaN for fewer than two values. The resampling has a fixed seed.
-
-    Examples:
-        >>> trimmed_mean_interval([1.0] * 9 + [1000.0], cut=0.1)[0]
-        1.0
-    """
-    sample = np.asarray(values, dtype=np.float64)
+    """Compute a trimmed mean and its 95 % bootstrap interval; the share `cut` is left out at either end."""
     from scipy import stats
 
-    mean = float(stats.trim_mean(sample, cut))
-    if len(sample) < 2:
-        return mean, np.nan, np.nan
-    drawn = sample[np.random.default_rng(0).integers(0, len(sample), (RESAMPLES, len(sample)))]
-    low, high = np.percentile(stats.trim_mean(drawn, cut, axis=1), [2.5, 97.5])
-    return mean, float(low), float(high)
+    sample = np.asarray(values, dtype=np.float64)
+    return _percentile_interval(lambda drawn: stats.trim_mean(sample[drawn], cut, axis=-1), len(sample))
 
 
 def ratio_interval(values: ArrayLike, others: ArrayLike) -> tuple[float, float, float]:
-    """Compute the ratio of two sums of pairs, such as days, and its 95 % bootstrap interval (percentiles).
-
-    Args:
-        values: (n,) numbers, n >= 1.
-        others: (n,) numbers.
-
-    Returns:
-        Ratio, lower and upper end, NaN for a single pair. The resampling of pairs has a fixed seed.
+    """Compute the ratio of two sums of pairs, such as days, and its 95 % bootstrap interval.
 
     Examples:
         >>> ratio_interval([2.0, 4.0], [1.0, 2.0])
         (2.0, 2.0, 2.0)
     """
-    mine, theirs = np.asarray(values, dtype=np.float64), np.asarray(others, dtype=np.float64)
-    if len(mine) < 2:
-        return float(mine.sum() / theirs.sum()), np.nan, np.nan
-    drawn = np.random.default_rng(0).integers(0, len(mine), (RESAMPLES, len(mine)))
-    low, high = np.percentile(mine[drawn].sum(axis=1) / theirs[drawn].sum(axis=1), [2.5, 97.5])
-    return float(mine.sum() / theirs.sum()), float(low), float(high)
+    sample, base = np.asarray(values, dtype=np.float64), np.asarray(others, dtype=np.float64)
+    return _percentile_interval(
+        lambda drawn: sample[drawn].sum(axis=-1) / base[drawn].sum(axis=-1), len(sample)
+    )
+
+
+def _percentile_interval(statistic: Callable[[NDArray[np.int64]], Any], n: int) -> tuple[float, float, float]:
+    """Return a statistic of n values and the ends of its bootstrap interval (percentiles), NaN for a single value.
+
+    `statistic` takes indices of the values, (..., n). The resampling has a fixed seed.
+    """
+    value = float(statistic(np.arange(n)))
+    if n < 2:
+        return value, np.nan, np.nan
+    low, high = np.percentile(statistic(np.random.default_rng(0).integers(0, n, (RESAMPLES, n))), [2.5, 97.5])
+    return value, float(low), float(high)
+
+
+def success_columns(name: str, successes: int, trials: int) -> dict[str, Any]:
+    """Return a rate and its 95 % interval (Wilson) as columns of a row."""
+    from scipy import stats
+
+    interval = stats.binomtest(successes, trials).proportion_ci(0.95, "wilson")
+    return columns_of(name, (successes / trials, float(interval.low), float(interval.high)))
 
 
 class Estimate(NamedTuple):
@@ -126,12 +110,7 @@ class Estimate(NamedTuple):
 
     @classmethod
     def combined(cls, parts: Iterable[tuple[float, Estimate]]) -> Self:
-        """Return a weighted sum of independent estimates, given as (weight, estimate) (Welch and Satterthwaite).
-
-        Examples:
-            >>> Estimate.combined([(0.5, Estimate(1.0, 0.3, 9.0)), (0.5, Estimate(2.0, 0.4, 9.0))]).mean
-            1.5
-        """
+        """Return a weighted sum of independent estimates, given as (weight, estimate) (Welch and Satterthwaite)."""
         weights, estimates = zip(*parts, strict=True)
         means, errors, freedom = np.array(estimates).T
         variances = np.square(np.multiply(weights, errors))
@@ -179,13 +158,13 @@ def stratified_estimate(
     fitted = 0
     if controls is not None:
         known = np.asarray(controls, np.float64)
-        found = averages.T @ known
+        observed = averages.T @ known
         # The standard error's own weights make its minimum a least-squares problem.
         scale = (member @ (weights / np.sqrt(counts * (counts - 1.0))))[:, None]
-        deviations = scale * (known - member @ found)
+        deviations = scale * (known - member @ observed)
         slopes, _, fitted, _ = np.linalg.lstsq(deviations, scale[:, 0] * residual)
-        mean += float(weights @ (np.asarray(control_means) - found) @ slopes)
-        residual = residual - (known - member @ found) @ slopes
+        mean += float(weights @ (np.asarray(control_means) - observed) @ slopes)
+        residual = residual - (known - member @ observed) @ slopes
     squares = member.T @ residual**2
     squares[squares <= (_ROUNDING * np.abs(sample).max()) ** 2 * counts] = 0.0
     free = len(sample) - len(weights)
@@ -197,12 +176,6 @@ def stratified_estimate(
 
 
 def columns_of(name: str, interval: tuple[float, float, float]) -> dict[str, Any]:
-    """Return a value and the ends of its interval as columns of a row.
-
-    Examples:
-        >>> columns_of("total_s", (2.0, 1.0, 3.0))
-        {'total_s': 2.0, 'total_s_ci95': [1.0, 3.0]}
-    """
     value, low, high = interval
     return {name: value, f"{name}_ci95": [low, high]}
 
@@ -217,7 +190,6 @@ MEANS = (
     "occupancy",
     "bound_s",
 )
-"""Columns of an episode that the table shows as plain means."""
 
 
 def summarize(
@@ -226,14 +198,9 @@ def summarize(
     first: Sequence[Mapping[str, Any]] | None = None,
     decision_s: ArrayLike = (),
 ) -> dict[str, Any]:
-    """Summarise the results of an agent in one setting as a row of the table.
+    """Return the row of an agent in one setting, which `columns` identify, from its rows of `episodes.csv`.
 
-    Args:
-        columns: columns that identify the row: scenario, agent, costs and speeds.
-        episodes: rows of `episodes.csv`.
-        first: rows of the agent to compare with, for the paired difference; rows with the same seed are paired. None
-            for that agent itself.
-        decision_s: (k,) wall time of single decisions, s.
+    Differences are to the rows of the same seeds in `first`; None for the first agent itself.
     """
     total, parked = _column(episodes, "total_s"), _column(episodes, "parked")
     row: dict[str, Any] = {
@@ -254,11 +221,7 @@ def summarize(
 
 
 def decision_columns(decision_s: ArrayLike) -> dict[str, float]:
-    """Return median and 99th percentile of wall times of decisions, ms, as columns; none without times.
-
-    Args:
-        decision_s: (k,) wall time of single decisions, s.
-    """
+    """Return median and 99th percentile of wall times of decisions, ms, as columns; none without times."""
     milliseconds = 1e3 * np.asarray(decision_s, dtype=np.float64)
     if not len(milliseconds):
         return {}
@@ -271,9 +234,8 @@ def decision_columns(decision_s: ArrayLike) -> dict[str, float]:
 def paired_differences(
     episodes: Sequence[Mapping[str, Any]], others: Sequence[Mapping[str, Any]]
 ) -> list[float]:
-    """Return the total times minus those of other rows with the same seeds, s."""
-    theirs = {e["seed"]: e["total_s"] for e in others}
-    return [e["total_s"] - theirs[e["seed"]] for e in episodes if e["seed"] in theirs]
+    totals = {e["seed"]: e["total_s"] for e in others}
+    return [e["total_s"] - totals[e["seed"]] for e in episodes if e["seed"] in totals]
 
 
 def _column(episodes: Sequence[Mapping[str, Any]], name: str) -> NDArray[np.float64]:

@@ -14,10 +14,15 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
+from pydantic import Field
+
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import BackendName
 from parkenv.files.option import option
-from parkenv.files.spec_file import Spec, read_tables
+from parkenv.files.spec_file import Several, Spec, read_tables
+from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.show.report.tables import part_of, tables_of
+from parkenv.studies.agent_spec import split_agents
 from parkenv.studies.results import (
     EPISODES,
     Key,
@@ -30,8 +35,6 @@ from parkenv.studies.workers import Task, Workers
 if TYPE_CHECKING:
     from parkenv.show.columns import Column
     from parkenv.show.report.page import Page
-    from parkenv.studies.report import ReplayJob
-    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
 
 STUDIES: Mapping[str, str] = {
@@ -47,7 +50,6 @@ STUDIES: Mapping[str, str] = {
     "train": "parkenv.studies.training.spec:TrainingSpec",
     "park": "parkenv.studies.trips.manoeuvre_study:ManoeuvreStudy",
 }
-"""`MODULE:CLASS` of each kind of study, by the key `kind` of its files."""
 
 
 Progress = Callable[[str, int, int], None]
@@ -55,7 +57,6 @@ Progress = Callable[[str, int, int], None]
 
 
 def run_tasks(doing: str, tasks: Sequence[Task[object]], workers: Workers, progress: Progress) -> None:
-    """Run tasks whose results nobody needs."""
     if tasks:
         progress(doing, 0, len(tasks))
     for number, _ in enumerate(workers.results(tasks), start=1):
@@ -83,20 +84,18 @@ class ExecutionSpec(Spec):
     )
     backend: BackendName = option(
         "loky",
-        "Run workers on this machine (loky), or on a Ray or Dask cluster (extras ray, dask).",
+        "Run workers on this machine (loky), or on a Dask cluster (extra dask).",
         panel="Machines",
     )
     address: str | None = option(
         None,
-        "Address of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler, "
-        "tcp://HOST:8786.",
-        takes="HOST:PORT",
+        "Address of the cluster's scheduler, tcp://HOST:8786.",
+        takes="tcp://HOST:PORT",
         panel="Machines",
         default="a cluster on this machine",
     )
 
     def workers(self) -> Workers:
-        """Return the workers, a context manager that connects to clusters."""
         return Workers(self.jobs or None, self.backend, self.address)
 
 
@@ -111,6 +110,74 @@ class Cell(NamedTuple):
 
     work: Any
     items: Sequence[Any]
+
+
+MOST_SLOTS = 20_000  # lots with more slots are not replayed: the page would not load
+AGREES_S = 1e-6  # total times of a search or a day that differ by less agree, s
+Recording = dict[str, Any]
+"""Searches in a world, a drive or a day in the data of a page; its `differences` from the run are notes."""
+
+
+class ReplayJob(NamedTuple):
+    """Searches, drives or days to run again for a page.
+
+    Attributes:
+        tasks: each returns a recording.
+        notes: what is left out, and why.
+    """
+
+    tasks: Sequence[Task[Recording]] = ()
+    notes: Sequence[str] = ()
+
+
+class NotInRunError(InputError):
+    """A search, a day or an agent was chosen that the run does not have."""
+
+
+class ReportOptions(Spec):
+    """What a page replays."""
+
+    episodes: int | None = option(
+        None,
+        "About how many episodes to replay, all agents together.",
+        short="-n",
+        default="20; through simulated sensors 4; 8 days of a fleet",
+        ge=0,
+    )
+    numbers: Several[float] | None = option(
+        None,
+        "Replay the episodes with these seeds, or these days of a fleet.",
+        name="--replay",
+        takes="SEED[,...]",
+        min_length=1,
+    )
+    agents: Several[str] | None = option(
+        None, "Replay only these agents.", takes="NAME[,...]", parse=split_agents
+    )
+    sessions: int = option(1, "Survey drives to replay.", ge=0)
+    frames: int = option(120, "Captures of them to keep, all drives together.", ge=2, le=250)
+    drives: Sequence[dict[str, Any]] | None = Field(
+        None, description="Recorded drives to use instead of driving again."
+    )
+
+    def chosen_agents(self, known: Sequence[str]) -> Sequence[str]:
+        for name in self.agents or ():
+            if name not in known:
+                raise NotInRunError(f"--agents has {name!r}; {nearest(name, list(dict.fromkeys(known)))}")
+        return known if self.agents is None else self.agents
+
+    def chosen_numbers(self, known: Sequence[int]) -> list[int] | None:
+        for number in self.numbers or ():
+            if number not in known:
+                span = f"{known[0]} to {known[-1]}" if known else "none"
+                raise NotInRunError(f"--replay has {number:g}; this run's are {span}")
+        return None if self.numbers is None else [int(number) for number in self.numbers]
+
+
+class Labelled(NamedTuple):
+    """Work of which only the columns that identify its rows are known."""
+
+    columns: Row
 
 
 class Study(ExecutionSpec):
@@ -174,13 +241,11 @@ class Study(ExecutionSpec):
 
     def outputs(self, result: Result) -> list[Task[object]]:
         """Return tasks that write what follows from a result into its folder, such as figures."""
-        del result
         return []
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
         """Return the results of a finished run in sentences, for its report; none by default."""
-        del summary
         return []
 
     @classmethod
@@ -204,16 +269,11 @@ class Study(ExecutionSpec):
     @classmethod
     def page_tables(cls, summary: Row, folder: Path) -> list[Row]:
         """Return the tables of a report; see `page`."""
-        from parkenv.show.report.tables import tables_of
-
-        del folder
         return tables_of(summary, cls.table_titles, cls.columns)
 
     @classmethod
     def printed(cls, summary: Row, folder: Path) -> list[Row]:
         """Return the tables that a terminal shows; see `page`."""
-        from parkenv.show.report.tables import part_of
-
         tables = {table["name"]: table for table in cls.page_tables(summary, folder)}
         return [
             part_of(tables[name], keys) if keys else tables[name]
@@ -224,7 +284,6 @@ class Study(ExecutionSpec):
     @classmethod
     def folder(cls, given: Mapping[str, Any]) -> Path:
         """Return where a command with these options, `--episodes` or `SUITE`, puts the results."""
-        del given
         return Path("results") / str(cls.model_fields["kind"].default)
 
     def with_options(self, given: Mapping[str, Any], *, resumed: bool) -> Self:
@@ -234,7 +293,6 @@ class Study(ExecutionSpec):
             given: the options, such as `--episodes`, and their texts.
             resumed: whether the study is that of a run to continue.
         """
-        del given, resumed
         return self
 
     def replays(self, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
@@ -243,7 +301,6 @@ class Study(ExecutionSpec):
         Raises:
             InputError, OSError: the run cannot be repeated.
         """
-        del folder, options
         return ()
 
     def keys(self, work: Any, item: Any) -> list[Key]:
@@ -259,7 +316,6 @@ class Study(ExecutionSpec):
 
     def stages(self, results: Results) -> Iterator[Stage]:
         """Yield the stages of the run; each may depend on the results of those before."""
-        del results
         yield Stage(self.doing, self, self.cells())
 
     def save_artifacts(self, work: Any, rows: Sequence[Row], results: Results) -> None:
@@ -281,7 +337,6 @@ class Stage(NamedTuple):
 
 
 def study_class(kind: object, source: str = "") -> type[Any]:
-    """Return the class of a kind of study."""
     if not isinstance(kind, str) or kind not in STUDIES:
         raise InputError(f"{source}: kind is {kind!r}; {nearest(str(kind), STUDIES)}")
     module, _, name = STUDIES[kind].partition(":")
@@ -290,9 +345,6 @@ def study_class(kind: object, source: str = "") -> type[Any]:
 
 
 def schemas() -> dict[str, dict[str, Any]]:
-    """Return the JSON schema of each kind of file, made from the class that validates it."""
-    from parkenv.scenarios.spec import ScenarioSpec
-
     models: dict[str, Any] = {"scenario": ScenarioSpec} | {kind: study_class(kind) for kind in STUDIES}
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     return {kind: draft | model.model_json_schema() for kind, model in models.items()}

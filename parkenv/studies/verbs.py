@@ -31,7 +31,6 @@ _DOC = """Run a study of kind `{kind}`, as `parkenv {kind}` does.
 
 
 def verb(study: type[Study]) -> Callable[..., Result]:
-    """Return the function that runs a kind of study and is named after it."""
     kind = study.model_fields["kind"].default
 
     def run_study(

@@ -80,7 +80,7 @@ class Benchmark(CaseStudy):
         self.cells()
 
     def settings(self) -> Row:
-        from parkenv.studies.fingerprints import agent_fingerprints
+        from parkenv.studies.results import agent_fingerprints
 
         return {
             "version": __version__,

@@ -159,7 +159,7 @@ class Commute(Study):
             run.start_map()
 
     def settings(self) -> Row:
-        from parkenv.studies.fingerprints import search_settings
+        from parkenv.studies.results import search_settings
 
         return search_settings(self, "seed", "fleet")
 

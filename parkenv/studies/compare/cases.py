@@ -13,7 +13,8 @@ import numpy as np
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.keyed_random import world_key
-from parkenv.errors import InputError
+from parkenv.engine.search_record import SearchRecord
+from parkenv.errors import InputError, ensure
 from parkenv.files.known_names import UNBEATEN
 from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.agent_spec import AgentSpec, label_of
@@ -29,9 +30,9 @@ from planners.agent import make_agent, shown_name
 from planners.belief.agent import BeliefAgent
 from planners.belief.best_path import is_compiled
 from planners.names import BOUND
+from planners.thesis.replanning import StaticAgent
 
-BUDGET = "budget_ms"
-"""The option of agents that plan for a time, ms a decision."""
+BUDGET = "budget_ms"  # the option of agents that plan for a time, ms a decision
 BLOCK = 50  # episodes per task of searches that are not saved
 
 
@@ -51,7 +52,6 @@ class Case:
 
     @property
     def label(self) -> str:
-        """Name of the agent with its options, for tables."""
         return label_of(shown_name(self.agent), dict(self.options))
 
     @property
@@ -62,7 +62,6 @@ class Case:
 
     @property
     def columns(self) -> Row:
-        """The columns that identify this case in tables."""
         return {
             "scenario": self.scenario.name,
             "occupancy_level": self.occupancy_level,
@@ -73,11 +72,9 @@ class Case:
         }
 
     def key(self, seed: int) -> tuple[Any, ...]:
-        """Return the key of an episode in `EPISODES`."""
         return EPISODES.key({**self.columns, "seed": seed})
 
     def run(self, seeds: Sequence[int]) -> list[Row]:
-        """Run one episode per seed; return their rows of `episodes.csv`, with the wall times of their decisions."""
         runner = self.runner()
         if isinstance(runner.agent, BeliefAgent) and not is_compiled():
             # First runs: workers that all begin with the environment would wait for the one that compiles it.
@@ -85,13 +82,11 @@ class Case:
         return [{**self.columns, **runner.row(seed)} for seed in seeds]
 
     def runner(self) -> EpisodeRunner:
-        """Return a runner of this case's episodes."""
         agent = make_agent(self.agent, self.scenario, **self.options)
         return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector, self.every)
 
 
 def _forecast_of(scenario: Scenario, seed: int) -> SlotBelief:
-    """Return the belief with which the search of a seed begins."""
     forecast = scenario.forecast(scenario.occupancy.draw_arrival(scenario.arrival, world_key(seed, 0)))
     days = forecast.day_error.level, forecast.day_error.slope
     return SlotBelief.of_forecast(forecast.p_occupied, forecast.decay_rate, days)
@@ -133,10 +128,10 @@ def at_occupancy(scenario: Scenario, level: float) -> Scenario:
     def adjusted(model: Any) -> Any:
         if model is None:
             return None
-        if not model.adjustable:
-            raise InputError(
-                f"scenario {scenario.name!r}: a {type(model).__name__} cannot be made {level:.0%} full"
-            )
+        ensure(
+            model.adjustable,
+            f"scenario {scenario.name!r}: a {type(model).__name__} cannot be made {level:.0%} full",
+        )
         return model.at_mean_occupancy(level, day * DAY_S + middle)
 
     return scenario.replace(
@@ -178,8 +173,32 @@ def rows_of(
     ]
 
 
+def plan_searches(
+    settings: Sequence[Scenario], agent: AgentSpec, seed: int
+) -> tuple[list[Row], list[SearchRecord]]:
+    """Plan and run a search in each setting, by an agent that makes a plan: mdp or mdp-static.
+
+    Return a row for each, with expected and total time, s, and the path; and the searches, for pictures.
+    """
+    rows, searches = list[Row](), list[SearchRecord]()
+    for setting in settings:
+        case = Case(setting, agent.name, options=agent.options)
+        runner = case.runner()
+        if not isinstance(runner.agent, StaticAgent):
+            raise InputError(f"--agents {agent.label!r} makes no plan; known: mdp, mdp-static")
+        search = runner.run(seed)
+        expected = float(runner.agent.expected_time(search.forecast)[search.path[0]])
+        ids, n = setting.lot.slot_ids, setting.lot.n_slots
+        path = [ids[v] if v < n else f"junction {v}" for v in search.path]
+        rows.append({
+            **case.columns, "expected_s": expected, "slot": path[-1] if search.metrics["parked"] else "",
+            **search.metrics, "path": path, "occupancy": float(np.mean(search.occupied)),
+        })  # fmt: skip
+        searches.append(search)
+    return rows, searches
+
+
 def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
-    """Check, before anything is written, that the scenario has a world and a forecast for every search."""
     days = set()
     for seed in seeds:
         key = world_key(seed, 0)

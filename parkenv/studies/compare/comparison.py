@@ -16,7 +16,7 @@ from parkenv.files.known_names import UNBEATEN
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, Spec
 from parkenv.scenarios.spec import Cost, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
-from parkenv.show.columns import SETTING_AXES, Column, shared
+from parkenv.show.columns import SETTING_AXES
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
@@ -34,27 +34,23 @@ from parkenv.studies.fields import (
     require_distinct_names,
     require_rig,
 )
-from parkenv.studies.results import Results, Row
-from parkenv.studies.study import Cell, Study
+from parkenv.studies.results import Results, Row, search_settings
+from parkenv.studies.study import Cell, ReplayJob, ReportOptions, Study
 from parkenv.studies.workers import Task
 from parkenv.world.cost_terms import COST_FIELDS
+from parkenv.world.sensor_model import SensorModel
 from planners.names import BOUND, HUMAN
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.compare.cases import Case
-    from parkenv.studies.report import ReplayJob
-    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 DEFAULT_AGENTS = (
     "mdp", "belief", "mdp-tuned", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
 )  # fmt: skip
-LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
-"""Occupancy levels of the command."""
-MOST_SETTINGS = 12
-"""Settings up to which the terminal shows all columns."""
+LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)  # occupancy levels of the command
 FAILURE_COST_SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
 """Failure costs of `--failure-cost sweep`, s."""
 NEEDS_OBSERVATIONS = ("belief", "belief-rivals", "mdp-tuned", "exact", "network")
@@ -202,11 +198,9 @@ class Comparison(CaseStudy):
 
     @property
     def episode_count(self) -> int:
-        """Upper bound on the episodes of all agents, scenarios and settings."""
         grid = self.grid
         failure, walk, drive = (
-            len(axis) if axis is not None else 1
-            for axis in (grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh)
+            len(axis or [0]) for axis in (grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh)
         )
         worlds = len(self.scenarios) * (1 + len(grid.constant_forecast)) * (1 + grid.blind)
         settings = (
@@ -220,16 +214,12 @@ class Comparison(CaseStudy):
         from parkenv.studies.compare.cases import BUDGET
         from planners.agent import agent_options
 
-        budgets = self.grid.budget_ms
-        return [
-            one
-            for agent in self.agents
-            for one in (
-                [AgentSpec(name=agent.name, **agent.options, **{BUDGET: ms}) for ms in budgets]
-                if budgets and BUDGET not in agent.options and BUDGET in agent_options(agent.name)
-                else [agent]
-            )
-        ]
+        budgets, agents = self.grid.budget_ms, list[AgentSpec]()
+        for agent in self.agents:
+            is_timed = budgets and BUDGET not in agent.options and BUDGET in agent_options(agent.name)
+            timed = [AgentSpec(name=agent.name, **agent.options, **{BUDGET: ms}) for ms in budgets]
+            agents += timed if is_timed else [agent]
+        return agents
 
     @cached_property
     def _base_scenarios(self) -> list[Scenario]:
@@ -239,39 +229,33 @@ class Comparison(CaseStudy):
 
     @cached_property
     def constant_forecasts(self) -> dict[str, tuple[Scenario, float]]:
-        """Scenarios with the same forecast for every slot, and its probability, by name."""
         from parkenv.world.occupancy.process import ConstantForecast
 
-        made = {}
+        variants = {}
         for p_occupied in self.grid.constant_forecast:
             for scenario in self._base_scenarios:
                 name = f"{scenario.name}{CONSTANT_FORECAST}{p_occupied:g}"
                 wrong = ConstantForecast(p_occupied, scenario.prior or scenario.occupancy)
-                made[name] = (scenario.replace(name=name, prior=wrong), p_occupied)
-        return made
+                variants[name] = (scenario.replace(name=name, prior=wrong), p_occupied)
+        return variants
 
     @cached_property
     def built(self) -> list[Scenario]:
-        """All scenarios, with their own costs and speeds."""
         from parkenv.scenarios.selection import blind_scenario
 
-        made = self._base_scenarios + [flat for flat, _ in self.constant_forecasts.values()]
-        return (
-            [s for scenario in made for s in (scenario, blind_scenario(scenario))]
-            if self.grid.blind
-            else made
-        )
+        scenarios = self._base_scenarios + [flat for flat, _ in self.constant_forecasts.values()]
+        if not self.grid.blind:
+            return scenarios
+        return [s for scenario in scenarios for s in (scenario, blind_scenario(scenario))]
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """The measured costs, if any."""
         from parkenv.scenarios.calibration import Calibration
 
         return None if self.grid.calibrated is None else Calibration.from_file(self.grid.calibrated)
 
     @property
     def seeds(self) -> range:
-        """Seeds of the episodes."""
         return range(self.seed, self.seed + self.episodes)
 
     def with_options(self, given: Mapping[str, Any], *, resumed: bool) -> Self:
@@ -325,8 +309,6 @@ class Comparison(CaseStudy):
             check_worlds(scenario, self.seeds)
 
     def settings(self) -> Row:
-        from parkenv.studies.fingerprints import search_settings
-
         return search_settings(self, "rig")
 
     def cells(self) -> list[Cell]:
@@ -334,33 +316,39 @@ class Comparison(CaseStudy):
 
     @cached_property
     def cases(self) -> list[Cell]:
-        """Every agent in every scenario and setting, with the seeds of its episodes."""
-        return [
-            Cell(self._case(setting, agent), self.seeds)
-            for scenario in self.built
-            for setting in self._settings(scenario)
-            for agent in self._agents_in(scenario)
-        ]
+        from parkenv.studies.compare.cases import settings_of
+
+        grid, measured, cells = self.grid, self.calibration, list[Cell]()
+        for scenario in self.built:
+            settings = settings_of(scenario, grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh)
+            if measured is not None:
+                settings += settings_of(measured.applied(scenario), v_walk_kmh=grid.v_walk_kmh)
+            agents = self._agents_in(scenario)
+            cells += [
+                Cell(self._case(setting, agent), self.seeds) for setting in settings for agent in agents
+            ]
+        return cells
 
     @cached_property
     def occupancy_cases(self) -> list[Cell]:
         """The cases at the occupancy levels, with a sixth of the episodes, at the first speeds of the grid."""
-        from parkenv.studies.compare.cases import at_occupancy
+        from parkenv.studies.compare.cases import at_occupancy, settings_of
 
+        failure, walk, drive = self.grid.failure_s, self.grid.v_walk_kmh, self.grid.v_drive_kmh
         return [
             Cell(self._case(setting, agent, level), self.seeds[: max(1, self.episodes // 6)])
             for scenario in self.built
             if scenario.occupancy.adjustable and scenario.name not in self.constant_forecasts
             for level in self.grid.occupancy_levels
-            for setting in self._grid_settings(at_occupancy(scenario, level), first_speeds=True)
+            for setting in settings_of(
+                at_occupancy(scenario, level), failure, walk and walk[:1], drive and drive[:1]
+            )
             for agent in self._agents_in(scenario)
             # Nobody has played in worlds of another occupancy.
             if not _is_person(agent.name)
         ]
 
     def _agents_in(self, scenario: Scenario) -> list[AgentSpec]:
-        from parkenv.world.sensor_model import SensorModel
-
         blind = scenario.sensor_model == SensorModel.blind()
         return [agent for agent in self.budgeted_agents if not blind or _works_blind(agent)]
 
@@ -369,26 +357,9 @@ class Comparison(CaseStudy):
 
         return Case(scenario, agent.name, level, self.rig, agent.options, self.detector)
 
-    def _settings(self, scenario: Scenario) -> list[Scenario]:
-        from parkenv.studies.compare.cases import settings_of
-
-        settings = self._grid_settings(scenario)
-        if (measured := self.calibration) is not None:
-            settings += settings_of(measured.applied(scenario), v_walk_kmh=self.grid.v_walk_kmh)
-        return settings
-
-    def _grid_settings(self, scenario: Scenario, first_speeds: bool = False) -> list[Scenario]:
-        from parkenv.studies.compare.cases import settings_of
-
-        walk, drive = self.grid.v_walk_kmh, self.grid.v_drive_kmh
-        if first_speeds:
-            walk, drive = walk and walk[:1], drive and drive[:1]
-        return settings_of(scenario, self.grid.failure_s, walk, drive)
-
     def prepare(self, results: Results, *, continues: bool) -> None:
         from parkenv.studies.compare.figures import remove_figures
 
-        del continues
         remove_figures(results.path)
 
     def summarise(self, results: Results) -> Row:
@@ -419,24 +390,8 @@ class Comparison(CaseStudy):
         return [partial(draw_figures, data, result.folder)]
 
     @classmethod
-    def printed(cls, summary: Row, folder: Path) -> list[Row]:
-        """See `Study`; of many settings, the mean total times alone."""
-        from parkenv.show.report.tables import spread, table_of
-
-        rows, names = summary["rows"], ("scenario", "v_walk_kmh", "v_drive_kmh", "agent")
-        if len({tuple(row[name] for name in ("scenario", *SETTING_AXES)) for row in rows}) <= MOST_SETTINGS:
-            return super().printed(summary, folder)
-        costs = sorted({row["failure_cost_s"] for row in rows})
-        columns = [Column(str(cost), f"{cost:g} s") for cost in costs]
-        by_cost = spread(rows, names, "failure_cost_s", "total_s")
-        return [
-            table_of("costs", "Mean total time, s, by failure cost", by_cost, (*shared(*names), *columns))
-        ]
-
-    @classmethod
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: the agents that none beats in the first setting; the table marks those of all."""
-        from parkenv.world.scenario import KMH
 
         def setting(row: Row) -> tuple[Any, ...]:
             return row["scenario"], *(row[name] for name in SETTING_AXES)
@@ -449,14 +404,13 @@ class Comparison(CaseStudy):
         if (measured := summary.get("calibrated")) is not None:
             findings.append(
                 f"Calibrated over {plural(measured['trips'], 'trip')}: failure cost {measured['failure_s']:.4g} s, "
-                f"drive {measured['v_drive'] / KMH:.4g} km/h. Parking takes {measured['manoeuvre_s']:.1f} s more for "
+                f"drive {3.6 * measured['v_drive']:.4g} km/h. Parking takes {measured['manoeuvre_s']:.1f} s more for "
                 "the manoeuvre into the slot, under either cost; the tables leave that out."
             )
         return findings
 
 
 def _driven(cells: Sequence[Cell]) -> list[Cell]:
-    """Return the cells in which cars drive: all but those of `bound`."""
     return [cell for cell in cells if cell.work.agent != BOUND]
 
 
@@ -470,15 +424,9 @@ def _is_person(agent: str) -> bool:
 
 def _seen_through(spec: ScenarioSpec, rig: str | None) -> ScenarioSpec:
     """Return the scenario with the rig's fitted sensor model, unless the scenario names another."""
-    if (
-        rig is None
-        or spec.sensor_model.name not in (None, "perfect")
-        or spec.sensor_model.hit_rate is not None
-    ):
+    model = spec.sensor_model
+    is_named = model.name not in (None, "perfect") or model.hit_rate is not None or model.file is not None
+    if rig is None or is_named:
         return spec
-    if spec.sensor_model.file is not None:
-        return spec
-    measured = SensorModelSpec(
-        name="stereo" if rig == "stereo" else "laser", view_range=spec.sensor_model.view_range
-    )
-    return spec.changed(sensor_model=measured)
+    name = "stereo" if rig == "stereo" else "laser"
+    return spec.changed(sensor_model=SensorModelSpec(name=name, view_range=model.view_range))

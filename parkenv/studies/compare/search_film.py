@@ -23,20 +23,15 @@ from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 from parkenv.world.lot import PARK
 
 FPS = 10.0
-DRIVE_SPEEDUP, WALK_SPEEDUP = 3.0, 12.0
-"""Playback speed relative to real time."""
-MOST_FRAMES = 360
-"""Maximum number of frames; longer searches are played faster."""
-COLORS = 192
-"""Number of colours of a film: enough for drawings and the camera's image."""
+DRIVE_SPEEDUP, WALK_SPEEDUP = 3.0, 12.0  # playback speed relative to real time
+MOST_FRAMES = 360  # maximum number of frames; longer searches are played faster
+COLORS = 192  # number of colours of a film: enough for drawings and the camera's image
 WIDTH, CAPTION, PANEL = 840, 48, 172
 """Width of a frame, and heights of the caption and of the panel below the map, px."""
-MAP_HEIGHT = (220, 420)
-"""Least and greatest height of the map, px."""
+MAP_HEIGHT = (220, 420)  # least and greatest height of the map, px
 PAPER = (248, 248, 245)
 SOFT = (96, 104, 112)
-INTRO_S, FAILED_S, PARKED_S, LAST_S = 2.5, 1.2, 1.2, 4.0
-"""How long single frames are shown, s."""
+INTRO_S, FAILED_S, PARKED_S, LAST_S = 2.5, 1.2, 1.2, 4.0  # how long single frames are shown, s
 
 _PARKING_FRAMES = 5
 _CAMERA = (213, 160)
@@ -63,7 +58,6 @@ class SearchFilm:
         self._end()
 
     def _step(self, moment: Moment) -> None:
-        """Show the way to the next vertex, or the parking attempt."""
         lot, before = self._scenario.lot, dict(self._parts)
         self._moment = moment
         if moment.vertex != self._path[-1]:
@@ -96,7 +90,6 @@ class SearchFilm:
         self._pose = end
 
     def _end(self) -> None:
-        """Show the driver's walk, and the total."""
         lot, metrics = self._scenario.lot, self._record.metrics
         if not self._parked:
             self._parts |= {key: float(metrics[key]) for key in self._parts}
@@ -115,13 +108,11 @@ class SearchFilm:
         self._take(f"At the goal after {metrics['total_s']:.0f} s", hold=LAST_S, walker=goal)
 
     def save(self, path: Path) -> None:
-        """Write the film as a GIF."""
         step = -(-len(self.frames) // MOST_FRAMES)
         save_film([*self.frames[:-1:step], self.frames[-1]], path, fps=FPS, colors=COLORS)
 
     @property
     def _parked(self) -> bool:
-        """Whether the car is in its slot."""
         return bool(self._moment.info.get("parked"))
 
     def _look(self, *, camera: bool = True) -> None:
@@ -140,12 +131,10 @@ class SearchFilm:
 
     @property
     def _here(self) -> FloatArray:
-        """Position of the car's vertex, (2,) m, which a window on a large lot shows."""
         here: FloatArray = self._scenario.lot.vertex_xy[self._moment.vertex]
         return here
 
     def _map_image(self, plan: Sequence[FloatArray], walker: FloatArray | None) -> Image:
-        """Return the map with the plan, the trail, the goal, the car and the walking driver."""
         scenario, here = self._scenario, self._here
         image, view, goal = self._slots.copy(), self._map.still(here).view, scenario.lot.goals[scenario.goal]
         layers: list[Layer] = []
@@ -181,7 +170,6 @@ class SearchFilm:
         walker: FloatArray | None = None,
         hold: float = 0.0,
     ) -> None:
-        """Draw a frame, and show it for `hold` seconds."""
         parts = elapsed or self._parts
         top = strip(CAPTION, WIDTH)
         write_text(top, caption, (16, 32), "white", 22, 600)
@@ -192,7 +180,6 @@ class SearchFilm:
         self.frames += [frame] * max(1, round(hold * FPS))
 
     def _panel(self, parts: dict[str, float]) -> Image:
-        """Draw the camera's image, the parts of the time so far, and the legend."""
         panel = np.full((PANEL, WIDTH, 3), PAPER, np.uint8)
         width, height = _CAMERA
         panel[6 : 6 + height, 6 : 6 + width] = self._camera
@@ -238,5 +225,4 @@ def _draw_legend(panel: Image, left: int) -> None:
 
 
 def film_search(case: Case, seed: int, path: Path) -> None:
-    """Repeat a search of a case with simulated sensors, and write a film of it."""
     SearchFilm(case.runner().run(seed, moments=True)).save(path)

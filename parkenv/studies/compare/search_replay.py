@@ -13,16 +13,14 @@ from numpy.typing import NDArray
 from parkenv.engine.search_record import SearchRecord
 from parkenv.show.scene import LotScene
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.report import AGREES_S, MOST_SLOTS, Recording, ReplayJob
-from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import EPISODES
+from parkenv.studies.study import AGREES_S, MOST_SLOTS, Recording, ReplayJob, ReportOptions
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.occupancy.process import World
 
 STEADY_S = 600.0
 """Time, s, up to which the true occupancy is recorded every second; later it is recorded only at decisions."""
-FULL = 255
-"""Recorded value of a belief of 1."""
+FULL = 255  # recorded value of a belief of 1
 SEARCHES, SENSED = 20, 4
 """Default number of replayed searches: in general, and with rendered sensors at every step."""
 

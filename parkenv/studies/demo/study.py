@@ -13,20 +13,21 @@ from pydantic import Field
 from parkenv.files.known_names import RigName
 from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.show.plurals import plural
 from parkenv.studies.compare.comparison import CaseStudy, Comparison
 from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, OneScenario, Seed
-from parkenv.studies.results import EPISODES, Results, Row, Table
+from parkenv.studies.results import EPISODES, Results, Row, Table, fingerprints, flat_tables
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
-from parkenv.studies.study import Cell, Stage, run_tasks
+from parkenv.studies.study import Cell, ReplayJob, ReportOptions, Stage, run_tasks
 from parkenv.studies.workers import Task
 from parkenv.version import __version__
+from parkenv.world.occupancy.arrival_window import DAY_NAMES
+from parkenv.world.sensor_model import SensorModel
 
 if TYPE_CHECKING:
     from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SessionResult, SurveySettings
-    from parkenv.studies.report import ReplayJob
-    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
@@ -35,10 +36,8 @@ FILMED = "belief"
 FILM, LOT = "search.gif", "lot.png"
 WITHOUT_IMAGES = " without images"
 """What is added to the name of the scenario in searches with the error rates of the sensors."""
-FIGURES = ("time_split", "time_distribution")
-"""Names of figures of comparisons."""
-QUICK = {"sessions": 2, "episodes": 2, "more": 100, "every": 4.0}
-"""Settings of a shorter demo."""
+FIGURES = ("time_split", "time_distribution")  # names of figures of comparisons
+QUICK = {"sessions": 2, "episodes": 2, "more": 100, "every": 4.0}  # settings of a shorter demo
 RIG: RigName = "laser"
 _HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
 _ONE_CAPTURE_M = 1e6  # between captures, of a short survey
@@ -99,7 +98,6 @@ class Demo(CaseStudy):
 
     @cached_property
     def survey(self) -> SurveyStudy:
-        """The survey."""
         return _RecordedSurvey(
             scenario=self.scenario,
             sessions=self.sessions,
@@ -115,7 +113,6 @@ class Demo(CaseStudy):
 
     def settings(self) -> Row:
         from parkenv.perception.detector_registry import detector_version
-        from parkenv.studies.fingerprints import fingerprints, flat_tables
 
         varied = {"jobs", "backend", "address", "episodes", "more"}
         return {
@@ -133,7 +130,6 @@ class Demo(CaseStudy):
         results.progress(f"The lot: {results.path / LOT}", 1, 1)
 
     def stages(self, results: Results) -> Iterator[Stage]:
-        """See `Study`; what many processes would compile at the same time is compiled first, by two tasks."""
         first: list[Task[object]] = [partial(_short_survey, self.survey.drive_settings), _short_searches]
         run_tasks("Compiling, once per installation", first, results.workers, results.progress)
         yield from self.survey.stages(results)
@@ -141,21 +137,14 @@ class Demo(CaseStudy):
         yield Stage("3/3 searches without images", self, self.more_cases_in(results.path))
 
     def cases_in(self, folder: Path) -> list[Cell]:
-        """Return the cases: every agent with the map in the folder and simulated sensors.
-
-        The oracle knows which slots are taken, so it needs no sensors.
-        """
         return self._cases_of(folder, "", self.episodes, rig=RIG, detector=self.detector, every=self.every)
 
     def more_cases_in(self, folder: Path) -> list[Cell]:
-        """Return the cases with the error rates of the sensors: every agent with the map in the folder."""
         return self._cases_of(folder, WITHOUT_IMAGES, self.more)
 
     def _cases_of(self, folder: Path, ending: str, episodes: int, **sensors: Any) -> list[Cell]:
-        """Return the cases in the scenario with the map in the folder, with an ending to its name."""
         from parkenv.mapping.learned_map import map_prior
         from parkenv.studies.compare.cases import Case
-        from parkenv.world.sensor_model import SensorModel
 
         scenario = self.survey.built
         prior = map_prior(self._log(folder), (), scenario.lot.walk_m(scenario.goal))
@@ -185,7 +174,6 @@ class Demo(CaseStudy):
         }
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: pictures and a film."""
         from parkenv.show.figures.survey import save_detections, save_session
         from parkenv.studies.compare.figures import ComparisonResults, draw_figures
         from parkenv.studies.compare.search_film import film_search
@@ -231,7 +219,6 @@ def _short_survey(settings: SurveySettings) -> None:
 
 def _short_searches() -> None:
     from parkenv.studies.compare.cases import Case
-    from parkenv.world.sensor_model import SensorModel
 
     # With errors of the sensors, as in the searches of the demo: another function steps without them.
     scenario = _small_scenario().replace(sensor_model=SensorModel.named(RIG))
@@ -247,10 +234,7 @@ def _small_scenario() -> Scenario:
 
 
 def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:
-    """Draw the map at the middle of the arrival window."""
-    from parkenv.show.plurals import plural
     from parkenv.studies.sensing.surveys import draw_map
-    from parkenv.world.occupancy.arrival_window import DAY_NAMES
 
     shown = replace(scenario.arrival, weekdays=scenario.arrival.weekdays[:2][-1:])
     hour, minute = divmod(int(0.5 * (shown.start_s + shown.end_s) // 60), 60)

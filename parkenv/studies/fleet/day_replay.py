@@ -20,9 +20,8 @@ from parkenv.show.scene import SQUARE, Lines, LotScene, building_layers, layer_d
 from parkenv.studies.fleet.day import ALL
 from parkenv.studies.fleet.setting import Setting, rate_text
 from parkenv.studies.fleet.tables import BLOCKS, HOURS, LANES, TABLES, Blocks, by_hour
-from parkenv.studies.report import AGREES_S, MOST_SLOTS, Recording, ReplayJob
-from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Key, Row, without_nan
+from parkenv.studies.study import AGREES_S, MOST_SLOTS, Recording, ReplayJob, ReportOptions
 from parkenv.world.lot import ParkingLot, is_building
 from parkenv.world.scenario import Scenario
 from parkenv.world.tariff import PUBLIC, Zone

@@ -50,15 +50,13 @@ from parkenv.studies.fleet.setting import (
     rate_text,
 )
 from parkenv.studies.results import Results, Row, Table
-from parkenv.studies.study import Cell, Study
+from parkenv.studies.study import Cell, ReplayJob, ReportOptions, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.engine.fleet import Fleet
     from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.fleet.day import Day, Roads
-    from parkenv.studies.report import ReplayJob
-    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 

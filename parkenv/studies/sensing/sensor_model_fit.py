@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -11,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from parkenv.compiled.arrays import IntArray
-from parkenv.errors import InputError
+from parkenv.errors import ensure
 from parkenv.studies.simulate import Observer, Step, simulate
 from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.scenario import Scenario
@@ -24,48 +23,36 @@ AGENTS = ("greedy-drive", "mdp", "first-free")
 """Agents whose searches are counted, so that the observations are those of typical searches."""
 LEAST_OBSERVATIONS = 20
 """Least number of observations in a band for rates of its own; otherwise those of all bands are used."""
+_NONE = np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64)
 _ASSUMED = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
 
 
-@dataclass(frozen=True, eq=False)
-class ObservationCounts:
-    """Counts of the slots in view after each step, by true and observed state."""
+def fitted_model(counts: IntArray) -> SensorModel:
+    """Return the sensor model with the rates of counts, with a Jeffreys prior of half an error in each band.
 
-    # (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken, and by
-    # observed state: none, free, taken
-    counts: IntArray
-
-    @classmethod
-    def none(cls) -> ObservationCounts:
-        """Return zero counts."""
-        return cls(np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64))
-
-    def __add__(self, other: ObservationCounts) -> ObservationCounts:
-        return ObservationCounts(self.counts + other.counts)
-
-    def fitted(self) -> SensorModel:
-        """Return the sensor model with these rates, with a Jeffreys prior of half an error in each band."""
-        reported = self.counts.sum(axis=(0, 1))[:, 1:]
-        if reported.sum(axis=1).min() < LEAST_OBSERVATIONS:
-            raise InputError(
-                f"{reported.sum(axis=1).tolist()} observations of free and of taken slots, want at least "
-                f"{LEAST_OBSERVATIONS} of each"
-            )
-        false_alarm, hit = _taken_rates(reported)
-        bands = []
-        for i, end in enumerate(BAND_ENDS):
-            for beside in (False, True):
-                counts = self.counts[i, int(beside)]
-                in_view, reported = counts.sum(), counts[:, 1:]
-                enough = reported.sum(axis=1).min() >= LEAST_OBSERVATIONS
-                rates = _taken_rates(reported) if enough else (false_alarm, hit)
-                seen = float(reported.sum() / in_view) if in_view else 0.0
-                bands.append(SensorBand(end, beside, round(seen, 4), round(rates[1], 4), round(rates[0], 4)))
-        return SensorModel(BAND_ENDS[-1], round(hit, 4), round(false_alarm, 4), tuple(bands))
+    `counts` are of the slots in view after each step, (bands, 2, 2, 3) int64: by distance, by whether the slot lies
+    beside the car, by whether it is taken, and by observed state: none, free, taken.
+    """
+    reported = counts.sum(axis=(0, 1))[:, 1:]
+    ensure(
+        reported.sum(axis=1).min() >= LEAST_OBSERVATIONS,
+        f"{reported.sum(axis=1).tolist()} observations of free and of taken slots, want at least "
+        f"{LEAST_OBSERVATIONS} of each",
+    )
+    false_alarm, hit = _taken_rates(reported)
+    bands = []
+    for i, end in enumerate(BAND_ENDS):
+        for beside in (False, True):
+            in_band = counts[i, int(beside)]
+            in_view, reported = in_band.sum(), in_band[:, 1:]
+            enough = reported.sum(axis=1).min() >= LEAST_OBSERVATIONS
+            rates = _taken_rates(reported) if enough else (false_alarm, hit)
+            seen = float(reported.sum() / in_view) if in_view else 0.0
+            bands.append(SensorBand(end, beside, round(seen, 4), round(rates[1], 4), round(rates[0], 4)))
+    return SensorModel(BAND_ENDS[-1], round(hit, 4), round(false_alarm, 4), tuple(bands))
 
 
 def _taken_rates(reported: IntArray) -> tuple[float, float]:
-    """Return the fraction observed as taken, for free slots and for taken slots."""
     free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in reported)
     return free, taken
 
@@ -78,10 +65,9 @@ class _ObservationCounter(Observer):
         distance, beside = scenario.sight_lines
         self._band = np.searchsorted(BAND_ENDS, distance)
         self._beside = beside.astype(np.int64)
-        self.counts = ObservationCounts.none()
+        self.counts = _NONE.copy()
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        del observation
         self._env: Any = env.unwrapped
 
     def on_step(self, step: Step) -> None:
@@ -93,7 +79,7 @@ class _ObservationCounter(Observer):
         reported = np.zeros(len(near), dtype=np.int64)
         reported[np.searchsorted(near, observed.slots)] = 1 + observed.taken
         taken = state.world.occupied(near, state.time).astype(np.int64)
-        np.add.at(self.counts.counts, (self._band[rows], self._beside[rows], taken, reported), 1)
+        np.add.at(self.counts, (self._band[rows], self._beside[rows], taken, reported), 1)
 
 
 def count_observations(
@@ -103,7 +89,7 @@ def count_observations(
     seeds: Sequence[int],
     weather: str | None = None,
     detector: str | None = None,
-) -> ObservationCounts:
+) -> IntArray:
     """Search with simulated sensors, and compare the perception pipeline's reports with the true occupancy.
 
     There is one seed per search. The weather is drawn for each search, and the detector the scenario's, if none is
@@ -129,7 +115,7 @@ def measure_sensors(
     detector: str | None = None,
     workers: Workers = SERIAL,
     on_progress: Callable[[], None] = lambda: None,
-) -> ObservationCounts:
+) -> IntArray:
     """Sum `count_observations` over all agents of `AGENTS` and all scenarios, with a number of searches of each."""
     tasks = [
         partial(count_observations, scenario, rig, agent, [s], weather, detector)
@@ -137,8 +123,8 @@ def measure_sensors(
         for s in range(seed, seed + searches)
         for agent in AGENTS
     ]
-    counts = ObservationCounts.none()
-    for _, more in workers.results(tasks):
-        counts += more
+    counts = _NONE.copy()
+    for _, observed in workers.results(tasks):
+        counts += observed
         on_progress()
     return counts

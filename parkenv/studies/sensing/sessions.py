@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from parkenv.studies.results import Table
 
-MAP_FILE = "map.sqlite"
-"""Map of the sessions in the folder of a survey or a demo."""
+MAP_FILE = "map.sqlite"  # map of the sessions in the folder of a survey or a demo
 ERROR_COLUMNS = ("range_error_m", "range_error_p95_m", "place_error_m", "heading_error_deg")
 SESSION_COLUMNS = (
     "key", "weather", "time_s", "parked", "found", "detections", "right",

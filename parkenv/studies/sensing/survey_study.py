@@ -12,26 +12,25 @@ from pydantic import AfterValidator, Field
 from parkenv.files.known_names import LocaliserName, RigName, WeatherName
 from parkenv.files.option import Inside, option
 from parkenv.files.spec_file import Several
+from parkenv.mapping.odometry import PoseNoise
 from parkenv.scenarios.spec import Hours, scenario_spec
 from parkenv.show.columns import Column, shared
 from parkenv.show.plurals import plural, slots_text
+from parkenv.show.report.tables import table_of
 from parkenv.studies.fields import PRICES, CaptureDistance, Detector, OneScenario, Seed, with_traffic
 from parkenv.studies.results import SETTINGS, Key, Results, Row, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
-from parkenv.studies.study import Cell, Stage, Study
+from parkenv.studies.study import Cell, ReplayJob, ReportOptions, Stage, Study
 from parkenv.studies.workers import Task
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
-    from parkenv.studies.report import ReplayJob
-    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
-PICTURES = 4
-"""Number of perception results of the first session that are kept for figures."""
-DRIVEN = "driven"
-"""Key of what a session found in its row; the map keeps it."""
+PICTURES = 4  # number of perception results of the first session that are kept for figures
+DRIVEN = "driven"  # key of what a session found in its row; the map keeps it
 SHOWN = "shown"
 """Key of the first session in `Results.kept`: its result, with perception results for figures, and its recording."""
 
@@ -168,17 +167,13 @@ class SurveyStudy(Study):
 
     @cached_property
     def built(self) -> Scenario:
-        """The scenario."""
         from parkenv.scenarios.build import build
 
         return build(self.scenario)
 
     @cached_property
     def drive_settings(self) -> SurveySettings:
-        """Settings of the drives."""
-        from parkenv.mapping.odometry import PoseNoise
         from parkenv.mapping.survey import SurveySettings
-        from parkenv.world.occupancy.arrival_window import ArrivalWindow
 
         days = self.scenario.arrivals.days
         return SurveySettings(
@@ -195,7 +190,6 @@ class SurveyStudy(Study):
 
     @cached_property
     def survey(self) -> Survey:
-        """The drives."""
         from parkenv.mapping.survey import Survey
 
         return Survey(self.built, self.drive_settings)
@@ -211,18 +205,15 @@ class SurveyStudy(Study):
         return [Cell("survey", range(self.sessions))]
 
     def keys(self, work: Any, item: int) -> list[Key]:
-        del work
         return [(self.survey.key_of(item),)]
 
     def run(self, work: Any, items: Sequence[int]) -> list[Row]:
         from parkenv.studies.sensing.surveys import session_row
 
-        del work
         driven = [self.drive(number) for number in items]
         return [session_row(result) | {DRIVEN: (result, recording)} for result, recording in driven]
 
     def drive(self, number: int) -> tuple[SessionResult, Any]:
-        """Drive a session, the first one with results for figures; return it with its recording, if any."""
         return self.survey.drive(number, pictures=PICTURES if number == 0 else 0), None
 
     def prepare(self, results: Results, *, continues: bool) -> None:
@@ -244,10 +235,8 @@ class SurveyStudy(Study):
         yield Stage(self.doing, self, self.cells())
 
     def save_artifacts(self, work: Any, rows: Sequence[Row], results: Results) -> None:
-        """See `Study`: sessions go into the map."""
         from parkenv.mapping.store import MapStore
 
-        del work
         with MapStore(results.path / MAP_FILE, self.built.lot) as store:
             for row in rows:
                 result, recording = row.pop(DRIVEN)
@@ -264,7 +253,6 @@ class SurveyStudy(Study):
         return {"rows": [summarize(self.built, self.drive_settings, rows, file)] if rows else []}
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: pictures of the map; those of the first session only if it was driven in this run."""
         from parkenv.studies.sensing.surveys import draw_survey
 
         shown, _ = result.results.kept.get(SHOWN, (None, None))
@@ -281,8 +269,6 @@ class SurveyStudy(Study):
 
     @classmethod
     def page_tables(cls, summary: Row, folder: Path) -> list[Row]:
-        from parkenv.show.report.tables import table_of
-
         (surveyed,) = summary["rows"]
         tables = [table_of("survey", "The survey", [surveyed], cls.columns, facts=True)]
         for name, title, rows in (
@@ -300,7 +286,6 @@ class SurveyStudy(Study):
         return tables
 
     def replays(self, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
-        from parkenv.studies.report import ReplayJob
 
         count = 0 if options.drives is not None else min(options.sessions, len(self.table.read(folder)))
         frames = options.frames // max(count, 1)

@@ -27,7 +27,6 @@ from parkenv.world.week import DAY_S
 
 
 def session_row(result: SessionResult) -> Row:
-    """Return the row of a session in `sessions.csv`."""
     score = result.score
     return dict(
         zip(
@@ -228,6 +227,5 @@ def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: Session
 
 
 def _mean(rows: Sequence[Row], column: str) -> float:
-    """Return the mean over all sessions with a finite value; NaN if there is none."""
     finite = [r[column] for r in rows if np.isfinite(r[column])]
     return float(np.mean(finite)) if finite else math.nan

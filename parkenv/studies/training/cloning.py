@@ -13,29 +13,25 @@ from numpy.typing import NDArray
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from parkenv.engine.local_observation import FollowedSearch
-from parkenv.errors import InputError
+from parkenv.errors import InputError, ensure
 from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.simulate import EpisodeResult, Observer, Step, simulate
 from parkenv.studies.training.configs import MAX_STEPS, REWARD_SCALE
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
 
-UPDATES = 3000
-"""Number of optimizer steps: enough for a policy that seldom deviates from the demonstrations."""
-CLONEABLE = ("ppo", "maskable-ppo")
-"""Algorithms whose policies can be cloned from demonstrations."""
+UPDATES = 3000  # number of optimizer steps: enough for a policy that seldom deviates from the demonstrations
+CLONEABLE = ("ppo", "maskable-ppo")  # algorithms whose policies can be cloned from demonstrations
 BATCH = 512
 LEARNING_RATE = 1e-3
 
 
 def require_cloneable(algorithm: str, agent: str, scenario: Scenario) -> None:
-    """Check that an algorithm supports behaviour cloning of an agent, before demonstrations are collected."""
-    if algorithm not in CLONEABLE:
-        raise InputError(f"{algorithm} has no behaviour cloning; take {' or '.join(CLONEABLE)}")
-    if isinstance(make_agent(agent, scenario), ClairvoyantAgent):
-        raise InputError(
-            f"{agent} cannot be cloned: it decides on the hidden occupancy, which no policy observes"
-        )
+    ensure(algorithm in CLONEABLE, f"{algorithm} has no behaviour cloning; take {' or '.join(CLONEABLE)}")
+    ensure(
+        not isinstance(make_agent(agent, scenario), ClairvoyantAgent),
+        f"{agent} cannot be cloned: it decides on the hidden occupancy, which no policy observes",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,19 +90,15 @@ class _DecisionRecorder(Observer):
         self.finished: list[list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]]] = []
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Start a search."""
-        del env
         self._decisions: list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]] = []
         self._now = self._local.observe(observation, begins=0)["local"]
 
     def on_step(self, step: Step) -> None:
-        """Record the decision."""
         mask = step.observation["action_mask"]
         self._decisions.append((self._now, mask, int(step.action), step.reward))
         self._now = self._local.observe(step.next_observation)["local"]
 
     def on_end(self, result: EpisodeResult) -> None:
-        """Keep the search unless it was truncated."""
         if not result.truncated:
             self.finished.append(self._decisions)
 

@@ -77,4 +77,3 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
         0.05,
     ),
 }
-"""Config of each algorithm for search."""

@@ -19,14 +19,12 @@ from parkenv.show.columns import Column, shared
 from parkenv.studies.agent_spec import AgentItem, split_agents
 from parkenv.studies.fields import MAX_EPISODES, SCENARIOS_TAKE, Level, ScenarioList, Scenarios, Seed
 from parkenv.studies.results import PAGE, SUMMARY, Row, Table, without_nan
-from parkenv.studies.study import Cell, Stage, Study
+from parkenv.studies.study import Cell, ReplayJob, ReportOptions, Stage, Study
 from parkenv.studies.training.curve_file import CURVE, read_curve
 from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.show.report.page import Page
-    from parkenv.studies.report import ReplayJob
-    from parkenv.studies.report_options import ReportOptions
     from parkenv.studies.results import Results
     from parkenv.studies.training.training import Training
 
@@ -34,12 +32,10 @@ _DAYS = Inside(only=("--day-error",))
 
 
 def agents_or_none(text: str) -> list[str]:
-    """Split agents at commas; none for `none`."""
     return [] if text == "none" else split_agents(text)
 
 
-FILES = "files"
-"""Key of the files of a training in its row."""
+FILES = "files"  # key of the files of a training in its row
 
 
 class _Seeds(NamedTuple):
@@ -63,8 +59,8 @@ class TrainingSpec(Study):
     So they run on any lot. They are evaluated in held-out worlds; each seed's best model is kept, and tested at the
     end. Hyperparameters are in parkenv/studies/training/configs.py.
 
-    With --resume, trainings continue from the checkpoints in --out; the models equal those of an uninterrupted
-    training. With more --steps, finished trainings continue, too.
+    With --resume, trainings continue from the checkpoints in --out, in worlds that they have not seen. With more
+    --steps, finished trainings continue, too.
     """
 
     table: ClassVar = Table("trainings.csv", ("seed",), ("steps", "wall_s"))
@@ -97,7 +93,6 @@ class TrainingSpec(Study):
         parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
         parkenv train maskable-ppo --scenario lots --held-out 0.2 --curriculum size
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
-        parkenv train ppo --beside results/maskable-ppo,results/dqn
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
         """
 
@@ -175,13 +170,6 @@ class TrainingSpec(Study):
             "first-free, greedy-drive",
         ),
     ] = Field(None, max_length=1_000, description="Agents to draw for comparison.")
-    beside: Several[str] = option(
-        (),
-        "Folders of other trainings with the same evaluations, drawn in the same figure.",
-        takes="DIR[,...]",
-        panel="Evaluation",
-        max_length=100,
-    )
     tensorboard: bool = option(False, "Write logs for TensorBoard to the folder.", panel="Results")
 
     @model_validator(mode="after")
@@ -210,7 +198,6 @@ class TrainingSpec(Study):
     def prepare(self, results: Results, *, continues: bool) -> None:
         from parkenv.studies.training.training import FIGURE
 
-        self.training.curves_beside(results.path)
         for outcome in (PAGE, FIGURE):
             (results.path / outcome).unlink(missing_ok=True)
         if not continues:
@@ -222,8 +209,6 @@ class TrainingSpec(Study):
 
     def stages(self, results: Results) -> Iterator[Stage]:
         """See `Study`; shorter trainings go on, and the bars follow the curves that trainings write."""
-        if self.training.announcement:
-            results.progress(self.training.announcement, 1, 1)
         rows = results.rows(self.table).values()
         results.replace([row for row in rows if row["steps"] >= self.steps], self.table)
         seeds = self.cells()[0].items
@@ -232,7 +217,6 @@ class TrainingSpec(Study):
             yield Stage(self.doing, self, [Cell(work, seeds)])
 
     def run(self, work: _Seeds, items: Sequence[int]) -> list[Row]:
-        """See `Study`; a training goes on from its checkpoint."""
         from parkenv.studies.training.training import MODEL, use_one_thread
 
         use_one_thread()
@@ -246,8 +230,6 @@ class TrainingSpec(Study):
         return rows
 
     def save_artifacts(self, work: _Seeds, rows: Sequence[Row], results: Results) -> None:
-        """See `Study`: the model and the curve."""
-        del work
         for row in rows:
             folder = results.path / f"seed_{row['seed']}"
             folder.mkdir(exist_ok=True)
@@ -256,14 +238,12 @@ class TrainingSpec(Study):
                     beside.write_bytes(content)
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`; the models are tested once all are trained."""
         if len(results.of(self, self.cells()[0])) < self.trainings:
             return {"rows": []}
         return {"settings": self.settings(), **self.training.report(results)}
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: the test."""
         rows = summary["rows"]
         if not rows:
             return []

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import os
 import threading
 import time
+import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -21,33 +22,28 @@ from stable_baselines3.common.utils import LinearSchedule
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import write_csv
-from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.build import build
 from parkenv.scenarios.selection import (
     by_size,
     lot_share,
     open_scenarios,
     require_different_names,
-    scenario_of_episode,
     split_by_lot,
 )
-from parkenv.show.figures.times import TRAINING_COLORS, save_learning_curves
+from parkenv.show.figures.times import save_learning_curves
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, rows_of
 from parkenv.studies.compare.search_replay import search_replay
-from parkenv.studies.fingerprints import fingerprints, flat_tables
-from parkenv.studies.report import ReplayJob
-from parkenv.studies.report_options import ReportOptions
-from parkenv.studies.results import SETTINGS, Results, read_settings
+from parkenv.studies.results import Results, fingerprints, flat_tables
 from parkenv.studies.simulate import charge_truncation
 from parkenv.studies.statistics import mean_interval
-from parkenv.studies.study import Progress
-from parkenv.studies.training.checkpoint import read_checkpoint, restore, save_checkpoint
+from parkenv.studies.study import Progress, ReplayJob, ReportOptions
 from parkenv.studies.training.cloning import Demonstrations, clone, require_cloneable
 from parkenv.studies.training.configs import MAX_STEPS, REWARD_SCALE, SEARCH_CONFIGS, TrainingConfig
-from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_curve, require_columns
+from parkenv.studies.training.curve_file import CURVE, Row, read_curve
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
@@ -65,20 +61,17 @@ EVALUATIONS, MOST_BETWEEN = 10, 100_000
 MODEL, FIGURE, CHECKPOINT = "model.safetensors", "learning_curve.png", "checkpoint.pt"
 METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
 HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
-BESIDE_MODELS = 3
-"""Number of planners replayed beside a trained model."""
-EVALUATED_BY = ("scenario", "held_out", "evaluation_episodes")
-"""Settings that evaluations depend on: curves are comparable if these are equal."""
+BESIDE_MODELS = 3  # number of planners replayed beside a trained model
+_FORMAT = "parkenv-checkpoint-3"
 PLANNERS = tuple(
     AgentSpec(name=name)
     for name in ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
 )
-"""Agents to compare with, if none are named."""
 PLANNERS_OF_PLACES = tuple(spec for spec in PLANNERS if spec.name not in ("mdp-tuned", "greedy-goal"))
 """The same with held-out places: those that need no time on each lot."""
 _OUTSIDE = {
     "kind", "jobs", "backend", "address", "trainings", "seed", "steps", "agents", "tensorboard", "scenarios",
-    "held_out", "evaluate_on", "test_on", "beside",
+    "held_out", "evaluate_on", "test_on",
 }  # fmt: skip
 """Fields of a specification that do not change its trainings, that `settings` gives in other words, or that a resumed
 training may change."""
@@ -100,12 +93,10 @@ class Training:
 
     @property
     def holds_out(self) -> bool:
-        """Whether evaluations are also in places that are not trained in."""
         return self.spec.held_out is not None or self.spec.evaluate_on is not None
 
     @property
     def compared(self) -> tuple[AgentSpec, ...]:
-        """Agents to compare with."""
         usual = PLANNERS_OF_PLACES if self.holds_out else PLANNERS
         return usual if self.spec.agents is None else self.spec.agents
 
@@ -136,20 +127,9 @@ class Training:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """All columns of `curve.csv`."""
         return ("steps", *self.metrics, "wall_s")
 
-    @property
-    def announcement(self) -> str | None:
-        """Which places are held out, if any."""
-        if not self.holds_out:
-            return None
-        learned, held_out = self.sides
-        names = ", ".join(scenario.name for scenario in held_out)
-        return f"Trained on {_places(learned)}, and evaluated on {_places(held_out)} held out: {names}"
-
     def check(self) -> None:
-        """Check, before training, that everything can be trained, tested and drawn."""
         algorithm_class(self.spec.algorithm)
         learned = self.sides[0]
         if self.spec.clone is not None:
@@ -159,7 +139,6 @@ class Training:
                 make_agent(agent.name, world, **agent.options)
 
     def settings(self) -> Row:
-        """Return the settings that a resumed training must share with this one."""
         given = (*self.spec.scenarios, *(self.spec.evaluate_on or ()))
         learned, held_out = self.sides
         return {
@@ -172,15 +151,12 @@ class Training:
 
     def demonstrations(self, progress: Progress) -> Demonstrations | None:
         """Record the searches of the planner to clone, if any, which the trainings with all seeds share."""
-        planner = self.spec.clone
-        if planner is None:
+        if self.spec.clone is None:
             return None
         count = self.spec.demonstrations or 2000
+        progress(f"Recording searches of {self.spec.clone}", 0, count)
         seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + count)
-        progress(f"Recording searches of {planner}", 0, count)
-        shown = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
-        progress(f"Recording searches of {planner}", count, count)
-        return shown
+        return Demonstrations.collect(self.spec.clone, self.sides[0], seeds, self.spec.k)
 
     @contextmanager
     def watched(self, out: Path, seeds: Sequence[int], progress: Progress) -> Iterator[None]:
@@ -193,8 +169,7 @@ class Training:
                     # The training itself reports a damaged curve.
                     with suppress(InputError):
                         if curve := read_curve(out / f"seed_{seed}" / CURVE, self.columns):
-                            last = curve[-1]
-                            progress(f"seed {seed}", last["steps"], self.spec.steps)
+                            progress(f"seed {seed}", curve[-1]["steps"], self.spec.steps)
 
         watcher = threading.Thread(target=follow, daemon=True)
         watcher.start()
@@ -206,39 +181,28 @@ class Training:
 
     # Learning
 
-    def config(self, n_envs: int | None = None) -> TrainingConfig:
-        """Return the training config of the algorithm.
-
-        Args:
-            n_envs: environments of the training that goes on; None for a new one.
-        """
-        return SEARCH_CONFIGS[self.spec.algorithm].for_steps(self.spec.steps, n_envs)
-
     @property
     def evaluate_every(self) -> int:
-        """Decisions between evaluations."""
         return self.spec.evaluate_every or min(max(1, self.spec.steps // EVALUATIONS), MOST_BETWEEN)
 
     def make_env(self, n_envs: int) -> SearchVecEnv:
-        """Make a batch of search environments over all scenarios."""
         places = self.sides[0] if self.spec.curriculum is None else by_size(self.sides[0])
         env = SearchVecEnv(n_envs, places, REWARD_SCALE, self.spec.k, "local", MAX_STEPS)
         self.open_scenarios(env, 0)
         return env
 
     def open_scenarios(self, env: SearchVecEnv, steps: int) -> None:
-        """Let the environments draw from the places that the curriculum has come to."""
         if self.spec.curriculum is not None:
             env.batch.n_scenarios = open_scenarios(len(self.sides[0]), steps / self.spec.steps)
 
     def train(
         self, seed: int, folder: Path, shown: Demonstrations | None = None, command: Sequence[str] = ()
     ) -> list[Row]:
-        """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
+        """Train with one seed; go on from the folder's checkpoint if there is one, in worlds of its own.
 
         `model.safetensors` is the model with the best evaluation, `curve.csv` lists all evaluations. The checkpoint
         stays, so that a training can be made longer: what depends on how much of it is over, such as the learning
-        rate, goes on as at that point of the longer one.
+        rate, goes on as at that point of the longer one. A replay buffer begins empty.
 
         Args:
             seed: seed of the network and of the worlds.
@@ -258,7 +222,7 @@ class Training:
                 f"{checkpoint}: is gone; the training cannot go on from {curve[-1]['steps']} steps"
             )
         begun = read_checkpoint(checkpoint) if checkpoint.exists() else None
-        config = self.config(begun and begun[0]["n_envs"])
+        config = SEARCH_CONFIGS[self.spec.algorithm].for_steps(self.spec.steps, begun and begun["n_envs"])
         env, rate = self.make_env(config.n_envs), config.settings["learning_rate"]
         model = algorithm_class(self.spec.algorithm)(
             config.policy,
@@ -272,16 +236,13 @@ class Training:
         if not self.spec.tensorboard:
             # Otherwise stable-baselines3 makes a new folder for logs in the system's folder of temporary files.
             model.set_logger(Logger(None, []))
-        # stable-baselines3 has seeded the environment with the network's seed.
-        env.seed(TRAINING_SEEDS * (seed + 1))
         if begun is not None:
-            state, curve = begun
-            require_columns(curve, self.columns, checkpoint)
-            restore(state, model)
-        else:
-            curve = []
-            if shown is not None:
-                clone(model, shown, seed)
+            restore(begun, model, checkpoint)
+        elif shown is not None:
+            clone(model, shown, seed)
+        # stable-baselines3 has seeded the environment with the network's seed.
+        env.seed(TRAINING_SEEDS * (seed + 1) + model.num_timesteps)
+        curve = [row for row in curve if begun and row["steps"] <= model.num_timesteps]
         evaluator = _Evaluator(self, config, folder, curve, command)
         left = self.spec.steps - model.num_timesteps
         if left > 0:
@@ -297,7 +258,6 @@ class Training:
         return dict(zip(self.metrics, itertools.chain.from_iterable(values), strict=True))
 
     def description(self, config: TrainingConfig) -> dict[str, Any]:
-        """Return scenarios and settings for the model file."""
         learned, held_out = self.sides
         return {
             "scenarios": [place.name for place in learned],
@@ -311,41 +271,34 @@ class Training:
     # Testing
 
     def report(self, results: Results) -> Row:
-        """Test the models, and draw the figure; return the entries of the summary."""
-        progress, beside = results.progress, self.curves_beside(results.path)
-        seeds = range(self.spec.seed, self.spec.seed + self.spec.trainings)
+        progress, seeds = results.progress, range(self.spec.seed, self.spec.seed + self.spec.trainings)
         folders = {seed: results.path / f"seed_{seed}" for seed in seeds}
         curves = [read_curve(folder / CURVE, self.columns) for folder in folders.values()]
         lines, planners = self._test_planners(progress, results.workers)
-        rows, transfer, places = list[Row](), list[Row](), list[Row]()
+        rows, transfer = list[Row](), list[Row]()
         # Of tests on either side of a split, the one on held-out places stands for the model.
         main = -1 if self.holds_out and self.spec.test_on is None else 0
         for number, (seed, folder) in enumerate(folders.items()):
             progress("Testing", number, len(folders))
-            model = folder / MODEL
-            of_model, last = {"agent": self.spec.algorithm, "seed": seed}, curves[number][-1]
-            tested, by_place = self.test(model)
-            transfer += [of_model | row for row in tested]
-            places += [of_model | row for row in by_place]
+            model, last = folder / MODEL, curves[number][-1]
+            tested = [{"agent": self.spec.algorithm, "seed": seed, **row} for row in self.test(model)]
+            transfer += tested
             rows.append({
                 "agent": self.spec.algorithm, "scenario": tested[main]["test_scenario"], "seed": seed,
                 "steps": last["steps"], "total_s": tested[main]["total_s"],
                 "total_s_ci95": tested[main]["total_s_ci95"],
                 "steps_per_s": last["steps"] / max(last["wall_s"], 1e-9), "model": str(model),
             })  # fmt: skip
-        drawn = self._drawn(curves) | beside
+        drawn = self._drawn(curves)
         means = {label: across_seeds(runs) for label, runs in drawn.items()}
         save_learning_curves(drawn, means, lines, self._title, results.path / FIGURE)
         progress("Testing", len(rows), len(rows))
         return {
             "rows": rows, "transfer": transfer, "planners": planners, "evaluated": lines,
-            **({"places": places} if places else {}),
             "curve": across_seeds(curves),
-            "beside": {name: across_seeds(runs) for name, runs in beside.items()},
         }  # fmt: skip
 
     def _test_planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
-        """Return the scores of the agents to compare with and of the clairvoyant bound, and the rows of their tests."""
         lines, rows = dict[str, float](), list[Row]()
         if self.compared:
             doing, count = "Planners in the same worlds", 1 + len(self.tests)
@@ -360,26 +313,12 @@ class Training:
             progress(doing, count, count)
         return lines, rows
 
-    def test(self, model: Path) -> tuple[list[Row], list[Row]]:
-        """Test a model; return a row for each test, and a row for each place of tests that are in many."""
+    def test(self, model: Path) -> list[Row]:
+        """Test a model; return a row for each test."""
         policy = LearnedAgent(self.sides[0][0], self.spec.algorithm, model).model
-        rows, by_place = list[Row](), list[Row]()
-        for name, places in self.tests.items():
-            times, parked = episode_times(policy, places, self.test_seeds)
-            rows.append({"test_scenario": name, **times_row(times, parked)})
-            if len(places) > 1:
-                by_place += [{"test_scenario": name, **row} for row in self._by_place(places, times, parked)]
-        return rows, by_place
-
-    def _by_place(
-        self, places: Sequence[Scenario], times: NDArray[np.float64], parked: NDArray[np.bool_]
-    ) -> list[Row]:
-        """Return a row of the test for each place that a search was in."""
-        scenario_index = np.array([scenario_of_episode(seed, 0, len(places)) for seed in self.test_seeds])
         return [
-            {"place": place.name, "slots": place.lot.n_slots, **times_row(times[of_place], parked[of_place])}
-            for i, place in enumerate(places)
-            if (of_place := scenario_index == i).any()
+            {"test_scenario": name, **times_row(*episode_times(policy, places, self.test_seeds))}
+            for name, places in self.tests.items()
         ]
 
     def replays(self, summary: Row, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
@@ -401,53 +340,20 @@ class Training:
 
     @property
     def _title(self) -> str:
-        """Title of the figure of learning curves."""
         learned, held_out = self.sides
         where = learned[0].name if len(learned) == 1 else _places(learned)
         where = f"{_places(held_out)} held out" if self.holds_out else where
         return f"{where}: {self.spec.evaluation_episodes} searches in held-out worlds"
 
     def _drawn(self, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
-        """Return the curves to draw, by name."""
-        name = name_of(self.settings())
+        scenarios = f" on {', '.join(s.name for s in self.sides[0])}" if len(self.sides[0]) > 1 else ""
+        name = self.spec.algorithm + scenarios
+        if self.spec.clone:
+            name = f"{name} after cloning {self.spec.clone}"
         if not self.holds_out:
             return {name: curves}
         apart = [[row | {"total_s": row["held_out_s"]} for row in curve] for curve in curves]
         return {f"{name}, {_places(self.sides[0])} trained on": curves, f"{name}, held out": apart}
-
-    def curves_beside(self, out: Path) -> dict[str, list[list[Row]]]:
-        """Read the curves of the trainings to draw beside: the rows of `curve.csv` of each seed, by name.
-
-        Args:
-            out: folder of this training.
-        """
-        if len(self.spec.beside) >= len(TRAINING_COLORS):
-            raise InputError(
-                f"--beside names {len(self.spec.beside)} folders, want at most {len(TRAINING_COLORS) - 1}"
-            )
-        own, known = self.settings(), {os.path.realpath(out)}
-        columns = ("steps", "total_s", "held_out_s") if self.holds_out else ("steps", "total_s")
-        beside: dict[str, list[list[Row]]] = {}
-        for folder in map(Path, self.spec.beside):
-            if os.path.realpath(folder) in known:
-                raise InputError(f"--beside: {folder} is already drawn")
-            known.add(os.path.realpath(folder))
-            settings = read_settings(folder)
-            curves = [read_curve(file, columns) for file in sorted(folder.glob(f"seed_*/{CURVE}"))]
-            curves = [curve for curve in curves if curve]
-            if settings is None or not curves or "algorithm" not in settings:
-                raise InputError(f"--beside: {folder} holds no training")
-            label = name_of(settings, str(folder / SETTINGS))
-            for name in EVALUATED_BY:
-                if settings.get(name) != own.get(name):
-                    raise InputError(
-                        f"--beside: {name} is {settings.get(name)!r} in {folder} and {own.get(name)!r} here; their "
-                        "evaluations cannot be compared"
-                    )
-            if label == name_of(own) or label in beside:
-                label = f"{label} ({folder})"
-            beside[label] = curves
-        return beside
 
 
 class _Evaluator(BaseCallback):  # type: ignore[misc]
@@ -468,7 +374,6 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         self._due = self._due_after(curve[-1]["steps"] if curve else 0)
 
     def _due_after(self, steps: int) -> int:
-        """Return the step of the next evaluation; it depends on `steps` alone, so an interruption changes nothing."""
         return self.subject.evaluate_every * (1 + steps // self.subject.evaluate_every)
 
     def _on_rollout_start(self) -> None:
@@ -492,12 +397,11 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
             save_model(model, self.folder / MODEL, results=scores, command=self.command, **described)
         write_csv(self.folder / CURVE, list(self.curve[0]), self.curve)
         # Last: a training that is killed before this line repeats what it has just done.
-        save_checkpoint(self.folder / CHECKPOINT, model, self.curve)
+        save_checkpoint(self.folder / CHECKPOINT, model)
         return scores
 
 
 def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
-    """Return the total times of episodes as columns of `parkenv compare`."""
     mean, low, high = mean_interval(times)
     return {
         "episodes": len(times),
@@ -540,7 +444,6 @@ def episode_times(model: Any, places: Scenario | Sequence[Scenario], seeds: Sequ
 
 def use_one_thread() -> None:
     """Let this process train on a single thread, so that one training per core can run in parallel."""
-    import torch
     from numba import get_num_threads
 
     # Starting numba's threads sets the number of OpenMP's, which PyTorch has, too.
@@ -548,24 +451,62 @@ def use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-class _Naming(Spec, extra="ignore"):
-    """The settings that a training is named after."""
+def save_checkpoint(path: Path, model: Any) -> None:
+    """Write the parameters of a model and its optimizer, and the number of its decisions; the file runs no code."""
+    state = {"format": _FORMAT, "n_envs": model.n_envs, "steps": model.num_timesteps}
+    with atomic_write(path) as beside, beside.open("wb", buffering=0) as file:
+        try:
+            torch.save(state | {"parameters": model.get_parameters()}, file)
+        except RuntimeError as error:
+            # PyTorch raises its own error after that of a full disk.
+            raise error.__context__ or error from None
 
-    algorithm: str
-    scenario: Several[str] | None = None
-    clone: str | None = None
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise ValueError("it has compressed parts")
+            if damaged := archive.testzip():
+                raise ValueError(f"{damaged} is not as it was written")
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        if state["format"] != _FORMAT or not all(
+            isinstance(state[name], int) for name in ("n_envs", "steps")
+        ):
+            raise ValueError(f"want {_FORMAT}")
+    except Exception as error:  # torch raises many types for damaged files
+        raise InputError(
+            f"{path}: no checkpoint of this version, or a damaged one ({error}); train again with --overwrite"
+        ) from error
+    return state
 
 
-def name_of(settings: Row, source: str = "settings") -> str:
-    """Return the name of a training in a figure with others."""
-    naming = _Naming.parse(settings, source)
-    scenarios = naming.scenario or ()
-    name = naming.algorithm + (f" on {', '.join(scenarios)}" if len(scenarios) > 1 else "")
-    return f"{name} after cloning {naming.clone}" if naming.clone else name
+def restore(state: dict[str, Any], model: Any, path: Path) -> None:
+    try:
+        model.set_parameters(state["parameters"], device="cpu")
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: does not fit this training ({error}); train again with --overwrite"
+        ) from error
+    model.num_timesteps = state["steps"]
+    if hasattr(model, "learning_starts"):
+        model.learning_starts += model.num_timesteps
+
+
+def across_seeds(curves: Sequence[Sequence[Row]]) -> list[dict[str, float]]:
+    """Return mean, 95 % interval and median of `total_s` over seeds, at evaluations that all seeds have."""
+    rows = []
+    for evaluations in zip(*curves, strict=False):
+        values = [row["total_s"] for row in evaluations]
+        mean, low, high = mean_interval(values)
+        rows.append({
+            "steps": float(np.mean([row["steps"] for row in evaluations])), "total_s": mean, "low_s": low,
+            "high_s": high, "median_s": float(np.median(values)),
+        })  # fmt: skip
+    return rows
 
 
 def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> None:
-    """Check that no place is on both sides."""
     if not held_out:
         return
     require_different_names([*learned, *held_out])

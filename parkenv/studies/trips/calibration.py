@@ -15,7 +15,7 @@ from scipy import stats
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.parking_task import KINDS
-from parkenv.errors import InputError
+from parkenv.errors import ensure
 from parkenv.files.known_names import OBSERVED
 from parkenv.scenarios.calibration import Calibration
 from parkenv.show.figures.picture_files import INK, picture
@@ -26,28 +26,16 @@ from parkenv.studies.trips.driven_search import Trip
 from parkenv.world.scenario import KMH, Scenario
 
 
-def trip_row(trip: Trip, slots: str) -> Row:
-    """Return a trip as JSON data; `slots` is `OBSERVED` or `UNOBSERVED`."""
-    row = dataclasses.asdict(trip)
-    return {
-        "slots": slots,
-        **row,
-        "legs": [list(leg) for leg in trip.legs],
-        "attempts": [list(t) for t in trip.attempts],
-    }
+def trip_row(trip: Trip) -> Row:
+    lists = {"legs": list(map(list, trip.legs)), "attempts": list(map(list, trip.attempts))}
+    return dataclasses.asdict(trip) | lists
 
 
 def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
-    """Collect the samples of each measured quantity.
+    """Return the samples of each measured quantity, in trips with observations but for failed attempts.
 
-    Args:
-        rows: rows of trips.
-        speed: speed on the lanes, m/s; converts the onward distance of a failed attempt into time.
-
-    Returns:
-        From trips with observations: `speed_kmh` on the lanes, and `manoeuvre_s`, also by kind of slot.
-        `failed_s`, also by kind of slot: time of a failed attempt until the car is back on the lane. `lost_s`: the
-        same, less the time of the onward distance. `s_per_m` by kind of edge.
+    `failed_s` is the time of a failed attempt until the car is back on the lane, `lost_s` the same less the time of the
+    onward distance at `speed`, m/s.
     """
     observed = [row for row in rows if row["slots"] == OBSERVED]
     attempts = [ParkingAttempt(*t) for row in rows for t in row["attempts"]]
@@ -74,7 +62,6 @@ def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
 
 
 def summary_of(values: FloatArray) -> Row:
-    """Return median, mean with its 95 % interval, and 95th percentile of a sample."""
     return {
         "n": len(values),
         "median": float(np.median(values)),
@@ -94,8 +81,7 @@ def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tu
     seconds = np.array([row["lanes_s"] for row in observed])
     known = samples(rows, speed_limit)
     for name, event in (("manoeuvre_s", "trip has parked"), ("lost_s", "attempt has failed")):
-        if name not in known:
-            raise InputError(f"of {len(rows)} trips in {scenario.name!r} no {event}: drive more trips")
+        ensure(name in known, f"of {len(rows)} trips in {scenario.name!r} no {event}: drive more trips")
     speed = float(metres.sum() / seconds.sum())
     table = [{"what": name, **summary_of(values)} for name, values in known.items()]
     ratio = [speed / KMH, speed / KMH]
@@ -111,7 +97,7 @@ def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tu
         ).confidence_interval
         ratio = [float(interval.low), float(interval.high)]
     table.insert(0, {"what": "v_drive_kmh", "n": len(observed), "mean": speed / KMH, "mean_ci95": ratio})
-    made = Calibration(
+    calibration = Calibration(
         scenario=scenario.name,
         v_drive=speed,
         failure_s=float(known["lost_s"].mean()),
@@ -119,11 +105,10 @@ def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tu
         trips=len(observed),
         speed_limit=speed_limit,
     )
-    return made, table
+    return calibration, table
 
 
 def save_distributions(rows: Sequence[Row], speed_limit: float, title: str, path: Path) -> None:
-    """Draw the distributions: speed, manoeuvres and failed attempts by kind of slot, edges by kind."""
     known = samples(rows, speed_limit)
     with picture(path, (10.0, 6.4)) as figure:
         figure.suptitle(title, x=0.02, ha="left", weight="bold")

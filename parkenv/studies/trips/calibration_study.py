@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from pydantic import model_validator
 
@@ -14,31 +14,20 @@ from parkenv.files.file_names import file_name
 from parkenv.files.known_names import OBSERVED, UNOBSERVED
 from parkenv.files.option import option
 from parkenv.scenarios.spec import Speed, scenario_spec
+from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, Vehicle, require_rig
-from parkenv.studies.results import Results, Row, Table
-from parkenv.studies.study import Cell, Study
+from parkenv.studies.results import Results, Row, Table, search_settings
+from parkenv.studies.study import Cell, Labelled, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
-    from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.runner import Result
     from parkenv.studies.trips.driven_car import DrivingStyle
     from parkenv.studies.trips.driven_search import DrivenSearch
     from parkenv.world.scenario import Scenario
 
 CALIBRATED = "calibrated.json"
-
-
-class _Trips(NamedTuple):
-    """Trips with or without observations of slots."""
-
-    slots: str
-
-    @property
-    def columns(self) -> Row:
-        """Columns that identify them."""
-        return {"slots": self.slots}
 
 
 class CalibrationStudy(Study):
@@ -94,27 +83,23 @@ class CalibrationStudy(Study):
 
     @cached_property
     def built(self) -> Scenario:
-        """The scenario."""
         from parkenv.scenarios.build import build
 
         return build(self.scenario)
 
     @cached_property
     def style(self) -> DrivingStyle:
-        """How the car drives."""
         from parkenv.studies.trips.driven_car import DrivingStyle
 
         return DrivingStyle(speed=self.speed_limit, notice_m=self.notice_m)
 
     @property
     def speed_limit(self) -> float:
-        """Speed limit on the lanes, m/s."""
         from parkenv.world.scenario import KMH
 
         return self.built.v_drive if self.v_drive_kmh is None else self.v_drive_kmh * KMH
 
     def search(self, slots: str) -> DrivenSearch:
-        """Return the trips with or without observations of slots."""
         from parkenv.scenarios.selection import blind_scenario
         from parkenv.studies.trips.driven_search import DrivenSearch
 
@@ -127,42 +112,32 @@ class CalibrationStudy(Study):
         self.search(OBSERVED)
 
     def settings(self) -> Row:
-        from parkenv.studies.fingerprints import search_settings
-
         driving = {"agent": self.agent.label, "style": dataclasses.asdict(self.style)}
         car = {"vehicle": dataclasses.asdict(self.vehicle)} if self.vehicle else {}
         return search_settings(self, "rig") | driving | car
 
     def cells(self) -> list[Cell]:
         seeds = range(self.seed, self.seed + self.episodes)
-        return [Cell(_Trips(slots), seeds) for slots in (OBSERVED, UNOBSERVED)]
+        return [Cell(Labelled({"slots": slots}), seeds) for slots in (OBSERVED, UNOBSERVED)]
 
-    def run(self, work: _Trips, items: Sequence[int]) -> list[Row]:
+    def run(self, work: Labelled, items: Sequence[int]) -> list[Row]:
         from parkenv.studies.trips.calibration import trip_row
 
-        search = self.search(work.slots)
-        return [trip_row(search.run(seed), work.slots) for seed in items]
+        search = self.search(work.columns["slots"])
+        return [work.columns | trip_row(search.run(seed)) for seed in items]
 
-    def label(self, work: _Trips) -> str:
-        del work
+    def label(self, work: Labelled) -> str:
         return f"{self.agent.label} in {self.built.name}"
 
-    def measured(self, rows: Sequence[Row]) -> tuple[Calibration, list[Row]]:
-        """Return the calibration and a row for each distribution."""
+    def summarise(self, results: Results) -> Row:
         from parkenv.studies.trips.calibration import calibrate
 
-        return calibrate(rows, self.built, self.speed_limit)
-
-    def summarise(self, results: Results) -> Row:
-        cells = self.cells()
-        rows = [row for cell in cells for row in results.of(self, cell)]
-        calibrated: Row | None = None
-        table: list[Row] = []
+        rows, calibrated, table = results.all_of(self), None, list[Row]()
         try:
-            made, table = self.measured(rows)
-            calibrated = dataclasses.asdict(made)
+            calibration, table = calibrate(rows, self.built, self.speed_limit)
+            calibrated = dataclasses.asdict(calibration)
         except InputError:
-            if len(rows) == sum(len(cell.items) for cell in cells):
+            if len(rows) == 2 * self.episodes:
                 raise
         return {
             **self.settings(),
@@ -175,11 +150,9 @@ class CalibrationStudy(Study):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        from parkenv.world.scenario import KMH
-
         measured = summary["calibrated"]
         return [
-            f"Calibrated: driving at {measured['v_drive'] / KMH:.2f} km/h, a failed attempt costs "
+            f"Calibrated: driving at {3.6 * measured['v_drive']:.2f} km/h, a failed attempt costs "
             f"{measured['failure_s']:.1f} s, and parking takes {measured['manoeuvre_s']:.1f} s that the drive graph "
             f"leaves out. In {summary['trips']} trips: {summary['contacts']} contacts, {summary['rescues']} times "
             "stuck."
@@ -187,19 +160,16 @@ class CalibrationStudy(Study):
 
     @property
     def title(self) -> str:
-        """Title of the table and of the figure."""
-        from parkenv.show.plurals import plural
-
         trips = plural(self.episodes, "trip")
         return f"{self.built.name}: {trips} with and as many without observations, by {self.agent.label}"
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: the calibration, and the figure."""
+        from parkenv.scenarios.calibration import Calibration
         from parkenv.studies.trips.calibration import save_distributions
 
-        rows: list[Any] = [row for cell in self.cells() for row in result.results.of(self, cell)]
         picture = result.folder / file_name(f"calibration_{self.built.name}", ".png")
+        rows = result.results.all_of(self)
         return [
-            partial(self.measured(rows)[0].to_file, result.folder / CALIBRATED),
+            partial(Calibration(**result.summary["calibrated"]).to_file, result.folder / CALIBRATED),
             partial(save_distributions, rows, self.speed_limit, self.title, picture),
         ]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
@@ -16,7 +17,7 @@ from parkenv.driving.road_users import RoadUsers
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
 from parkenv.driving.yielding_traffic import YieldingTraffic
 from parkenv.envs.drive import CONTROL_S, SUBSTEPS
-from parkenv.errors import InputError
+from parkenv.files.field_types import Number, Positive, Validated
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
 from planners.driving.parking import STRAYED_M, STRAYED_RAD
@@ -35,7 +36,6 @@ TAKEN, NO_ROOM, NO_WAY = "taken", "too narrow", "no way in"  # reasons of failed
 RESCUE_S = 60.0  # time until a stuck car is back on the lane, s
 PATIENCE_S = 3.0  # time for which the car and a waiting road user both stand until the other gives way, s
 
-_LEAST_NOTICE = 0.8
 _WAITS_M = 7.0
 _SOON_S = 0.8  # brake hard for encounters within this time
 _NO_CLOCKS = np.empty(0)
@@ -72,34 +72,14 @@ class TrackPoint(NamedTuple):
 
 
 @dataclass(frozen=True)
-class DrivingStyle:
-    """Parameters of driving.
+class DrivingStyle(Validated):
+    """Parameters of driving."""
 
-    Example:
-        >>> DrivingStyle(notice_m=0.1)
-        Traceback (most recent call last):
-        ...
-        parkenv.errors.InputError: driving notice_m is 0.1 m, want at least 0.8, or the car could not stop in time
-    """
-
-    speed: float | None = None  # maximum on the lanes, m/s; None for the scenario's `v_drive`
-    acceleration: float = 1.2  # acceleration, and deceleration before turns, m/s²
-    braking: float = 2.0  # deceleration before parking, m/s²
-    # distance along the path, m, at which the car notices at the latest that a slot is taken
-    notice_m: float = 2.0
-
-    def __post_init__(self) -> None:
-        for name in ("speed", "acceleration", "braking", "notice_m"):
-            value = getattr(self, name)
-            if name == "speed" and value is None:
-                continue
-            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0.0):
-                raise InputError(f"driving {name} is {value!r}, want a finite number above 0")
-        if self.notice_m < _LEAST_NOTICE:
-            raise InputError(
-                f"driving notice_m is {self.notice_m:g} m, want at least {_LEAST_NOTICE:g}, or the car could not stop "
-                "in time"
-            )
+    speed: Positive | None = None  # maximum on the lanes, m/s; None for the scenario's `v_drive`
+    acceleration: Positive = 1.2  # acceleration, and deceleration before turns, m/s²
+    braking: Positive = 2.0  # deceleration before parking, m/s²
+    # distance along the path, m, at which the car notices at the latest that a slot is taken; it must be able to stop
+    notice_m: Annotated[Number, Field(ge=0.8)] = 2.0
 
 
 @dataclass
@@ -146,7 +126,6 @@ class DrivenCar:
         self.time = 0.0
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
-        """Start near a vertex, at a time in s, in the world with this key."""
         self._around.begin(key, world)
         self.log = DriveLog()
         self.track = []
@@ -181,13 +160,11 @@ class DrivenCar:
             self.others.clear_area(self.vehicle.corners(self.state[:3]))
 
     def rescue(self, pose: FloatArray) -> None:
-        """Put a stuck car back onto the lane."""
         self.log.rescues += 1
         self.time += RESCUE_S
         self.place(pose, 0.0)
 
     def parked_outline(self, slot: int) -> FloatArray | None:
-        """Outline of the car that is parked in a slot."""
         return self._around.footprint(slot, self.time)
 
     def all_slots_taken(self, center: FloatArray) -> Obstacles:
@@ -195,7 +172,6 @@ class DrivenCar:
         return self._around.worst_case(center)
 
     def movers_at(self, point: TrackPoint) -> Movers | None:
-        """Return the road users at the time of a point of `track`."""
         return None if self.others is None else self.others.movers(point.clocks)
 
     def follow(self, tracker: PathTracker, notices: Callable[[], bool] | None = None) -> bool:
@@ -215,7 +191,6 @@ class DrivenCar:
                 self.step(*command)
 
     def yields(self, tracker: PathTracker) -> bool:
-        """Brake or stand for one step if a road user blocks the path; return whether the car did."""
         if self.others is None:
             return False
         speed = abs(float(self.state[SPEED]))
@@ -233,13 +208,11 @@ class DrivenCar:
         return True
 
     def halt(self, braking: float, tracker: PathTracker | None = None) -> None:
-        """Brake to a standstill."""
         self.refresh()
         while self.state[SPEED] != 0.0:
             self.brake(braking, tracker)
 
     def brake(self, braking: float, tracker: PathTracker | None = None) -> None:
-        """Brake for one control step along the current path."""
         speed, steering = float(self.state[SPEED]), float(self.state[STEERING])
         tracker = tracker or self.path
         wheels = steering / self.vehicle.max_steering
@@ -249,7 +222,6 @@ class DrivenCar:
         self.step(-math.copysign(min(share, 1.0), speed) if speed else 0.0, wheels)
 
     def step(self, acceleration: float, steering: float) -> None:
-        """Advance the car by one control step."""
         others = self.others
         if others is not None:
             others.advance(CONTROL_S, self.vehicle.corners(self.state[:3]))
@@ -271,7 +243,6 @@ class DrivenCar:
             self.refresh()
 
     def refresh(self) -> None:
-        """Update the obstacles around the car."""
         self.enter(self.standing(self.state[:2]))
 
     def standing(self, center: FloatArray, looks_free: int | None = None) -> Obstacles:
@@ -285,7 +256,6 @@ class DrivenCar:
         return self._around.at_time(center, self.time, sorted(taken - {looks_free}))
 
     def enter(self, there: Obstacles) -> None:
-        """Build the collision world of these obstacles."""
         if self.others is None:
             self._space = CollisionWorld(self.vehicle, there)
         else:

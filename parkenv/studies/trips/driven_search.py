@@ -51,7 +51,6 @@ class DrivenSearchEnv(SearchEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start a search with the car at the entry."""
         if self.perception is not None:
             self.perception.reset()
         result = super().reset(seed=seed, options=options)
@@ -65,7 +64,6 @@ class DrivenSearchEnv(SearchEnv):
         return self._drive_step
 
     def _drive_step(self, address: int, action: int) -> tuple[Any, ...]:
-        """Execute the action, and advance the world by the time it took."""
         state = self._state
         vertex, begin = state.vertex, state.time
         possible = self.scenario.action_masks[vertex, action] == 1
@@ -87,7 +85,6 @@ class DrivenSearchEnv(SearchEnv):
         return result
 
     def _observe(self, *, moved: bool) -> None:
-        """Update the belief from the observations along the driven path and at its end."""
         perception = self.perception
         if perception is None:
             kernel.observe_at(self._address)
@@ -185,12 +182,6 @@ class DrivenSearch:
         self._limited = adapt_to_agent(TimeLimit(self.env, STEP_LIMIT), self._agent)
 
     def run(self, seed: int, observers: Sequence[Observer] = ()) -> Trip:
-        """Drive one trip in the world of a seed.
-
-        Args:
-            seed: seed of the world, at least 0.
-            observers: observers of the decisions.
-        """
         require_whole("seed", seed)
         env, driver = self.env, self.driver
         result = simulate(self._limited, self._agent, int(seed), observers)

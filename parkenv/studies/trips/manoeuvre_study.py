@@ -8,19 +8,19 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo
 
-from parkenv.errors import InputError
+from parkenv.errors import ensure
 from parkenv.files.known_names import SCENE_LEVELS
 from parkenv.files.option import option, words_in
 from parkenv.files.spec_file import Axis
 from parkenv.show.columns import Column
 from parkenv.studies.fields import Figures, Seed, Vehicle
-from parkenv.studies.fingerprints import fingerprints
-from parkenv.studies.results import Results, Row, Table
-from parkenv.studies.study import Cell, Study
+from parkenv.studies.results import Results, Row, Table, fingerprints
+from parkenv.studies.study import Cell, Labelled, Study
 from parkenv.version import __version__
 
 if TYPE_CHECKING:
@@ -41,19 +41,12 @@ MANOEUVRES = Table(
 _STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "steering_rad")
 TRAJECTORIES = Table("trajectories.csv", _SCENE, ("time_s", *_STATE), long=True)
 ROAD_USERS = Table("road_users.csv", _SCENE, ("time_s", "user", *_STATE[:3]), long=True)
-SHEET = 12
-"""Greatest number of scenes on a picture."""
+SHEET = 12  # greatest number of scenes on a picture
 
 
 def _there(value: object, info: ValidationInfo) -> object:
     folder = (info.context or {}).get("folder", Path())
     return (Path(folder) / Path(value).expanduser()).absolute() if isinstance(value, str | Path) else value
-
-
-class _Planned(NamedTuple):
-    """Scenes for the planner."""
-
-    columns: Row = {"agent": "planner"}  # noqa: RUF012 - never changed
 
 
 class ManoeuvreStudy(Study):
@@ -144,7 +137,6 @@ class ManoeuvreStudy(Study):
         return {f"{level}-{seed}": (level, seed) for level in self.levels or () for seed in seeds}
 
     def scene(self, name: str) -> Scene:
-        """Return a scene by its name."""
         from parkenv.driving.levels import level_scene
         from parkenv.driving.scene_files import read_scene
 
@@ -154,9 +146,10 @@ class ManoeuvreStudy(Study):
         return level_scene(*source, self.vehicle)
 
     def check(self) -> None:
-        """See `Study`: all files are read, and a scene of each level is drawn."""
-        if (self.cases is None) == (self.levels is None):
-            raise InputError("cases and levels exclude each other: want one of them")
+        ensure(
+            (self.cases is None) != (self.levels is None),
+            "cases and levels exclude each other: want one of them",
+        )
         if self.shorten_s > 0.0:
             from planners.driving.time_optimal import require_casadi
 
@@ -168,41 +161,35 @@ class ManoeuvreStudy(Study):
         return {"version": __version__, **self.tables(), "files": fingerprints(self.files())}
 
     def files(self) -> list[Path]:
-        """See `Spec`: the scenes instead of their folder."""
         scenes = [source for source in self.sources.values() if isinstance(source, Path)]
         return [file for file in super().files() if file != self.cases] + scenes
 
     def cells(self) -> list[Cell]:
-        return [Cell(_Planned(), list(self.sources))]
+        return [Cell(Labelled({"agent": "planner"}), list(self.sources))]
 
-    def run(self, work: _Planned, items: Sequence[str]) -> list[Row]:
+    def run(self, work: Labelled, items: Sequence[str]) -> list[Row]:
         from planners.driving.manoeuvre import park
         from planners.driving.time_optimal import shorten
 
         _warm()
-        made = {name: park(self.scene(name)) for name in items}
+        manoeuvres = {name: park(self.scene(name)) for name in items}
         if self.shorten_s > 0.0:
-            made = {name: shorten(each, self.shorten_s) for name, each in made.items()}
-        return [manoeuvre_row(work.columns | {"case": name}, each) for name, each in made.items()]
+            manoeuvres = {name: shorten(each, self.shorten_s) for name, each in manoeuvres.items()}
+        return [manoeuvre_row(work.columns | {"case": name}, each) for name, each in manoeuvres.items()]
 
     def summarise(self, results: Results) -> Row:
-        rows = [row for cell in self.cells() for row in results.of(self, cell)]
         names = (*MANOEUVRES.keys, *MANOEUVRES.columns)
-        rows = [{name: row[name] for name in names} for row in rows]
+        rows = [{name: row[name] for name in names} for row in results.all_of(self)]
         levels = {
             name: "cases" if isinstance(source, Path) else source[0] for name, source in self.sources.items()
         }
+        cars = Counter(self.scene(name).vehicle for name in dict.fromkeys(row["case"] for row in rows))
         return {
             "levels": level_table(rows, levels.__getitem__),
             "agents": level_table(rows, lambda _: "all"),
-            "vehicles": self._vehicles(list(dict.fromkeys(row["case"] for row in rows))),
+            "vehicles": [{"scenes": n, **dataclasses.asdict(car)} for car, n in cars.items()],
             "rows": rows,
         }
-
-    def _vehicles(self, names: Sequence[str]) -> list[Row]:
-        """Return each car with the number of its scenes."""
-        cars = Counter(self.scene(name).vehicle for name in names)
-        return [{"scenes": count, **dataclasses.asdict(car)} for car, count in cars.items()]
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
@@ -214,7 +201,6 @@ class ManoeuvreStudy(Study):
         ]
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: pictures of all scenes, those that failed first, and a film of the longest manoeuvre."""
         from parkenv.show.figures.manoeuvres import save_manoeuvre_film, save_manoeuvres
 
         rows = sorted(result.rows, key=lambda row: row["driven"])
@@ -244,63 +230,50 @@ class ManoeuvreStudy(Study):
         return "no path" if not row["planned"] else "contact" if row["contact"] else "not at the target"
 
 
-def manoeuvre_row(keys: Row, made: Manoeuvre) -> Row:
+def manoeuvre_row(keys: Row, manoeuvre: Manoeuvre) -> Row:
     """Return the row of a manoeuvre, with those of its trajectory and of road users, in the frame of its file."""
     from parkenv.driving.vehicle import PHYSICS_S
 
-    lines = made.states[:, : len(_STATE)].round(7)
-    lines[:, :2] += made.scene.origin
+    lines = manoeuvre.states[:, : len(_STATE)].round(7)
+    lines[:, :2] += manoeuvre.scene.origin
     time, others = [round(PHYSICS_S * i, 2) for i in range(len(lines))], dict[str, Row]()
-    if made.others is not None:
-        users, n = made.others.round(7).reshape(-1, 3), made.others.shape[1]
-        users[:, :2] += made.scene.origin
+    if manoeuvre.others is not None:
+        users, n = manoeuvre.others.round(7).reshape(-1, 3), manoeuvre.others.shape[1]
+        users[:, :2] += manoeuvre.scene.origin
         named = {"time_s": [at for at in time for _ in range(n)], "user": list(range(n)) * len(time)}
         named |= dict(zip(_STATE[:3], users.T.tolist(), strict=True))
         others[ROAD_USERS.file] = keys | named
     return {
         **keys,
-        "planned": made.path is not None,
-        **made.judged._asdict(),
-        "time_s": made.time_s,
-        "length_m": made.length_m,
-        "direction_changes": made.direction_changes,
-        "planning_s": made.planning_s,
+        "planned": manoeuvre.path is not None,
+        **manoeuvre.judged._asdict(),
+        "time_s": manoeuvre.time_s,
+        "length_m": manoeuvre.length_m,
+        "direction_changes": manoeuvre.direction_changes,
+        "planning_s": manoeuvre.planning_s,
         TRAJECTORIES.file: {**keys, "time_s": time, **dict(zip(_STATE, lines.T.tolist(), strict=True))},
         **others,
     }
 
 
 def level_table(rows: Sequence[Row], level: Callable[[str], str]) -> list[Row]:
-    """Summarise manoeuvres: a row for each agent and each of its levels.
-
-    Args:
-        rows: of `MANOEUVRES`.
-        level: level of a case.
-
-    Returns:
-        agent, level, scenes, planned, driven, success (fraction that was driven) and its 95 % interval (Wilson),
-        contacts; median time_s, length_m and direction_changes of those that were driven; planning_ms (median),
-        planning_ms_p95, planning_ms_max.
-    """
-    import numpy as np
-    from scipy.stats import binomtest
+    """Summarise rows of `MANOEUVRES`: a row for each agent and each of its levels, of which `level` names a case's."""
+    from parkenv.studies.statistics import success_columns
 
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["agent"], level(row["case"])), []).append(row)
     table = list[Row]()
-    for (agent, name), its in groups.items():
-        driven, planning = [row for row in its if row["driven"]], [1e3 * row["planning_s"] for row in its]
-        interval = binomtest(len(driven), len(its)).proportion_ci(0.95, "wilson")
+    for (agent, name), group in groups.items():
+        driven, planning = [row for row in group if row["driven"]], [1e3 * row["planning_s"] for row in group]
         medians = {
             key: float(np.median([row[key] for row in driven])) if driven else np.nan
             for key in ("time_s", "length_m", "direction_changes")
         }
         table.append({
-            "agent": agent, "level": name, "scenes": len(its), "planned": sum(row["planned"] for row in its),
-            "driven": len(driven), "success": len(driven) / len(its),
-            "success_ci95": [float(interval.low), float(interval.high)],
-            "contacts": sum(row["contact"] for row in its), **medians, "planning_ms": float(np.median(planning)),
+            "agent": agent, "level": name, "scenes": len(group), "planned": sum(row["planned"] for row in group),
+            "driven": len(driven), **success_columns("success", len(driven), len(group)),
+            "contacts": sum(row["contact"] for row in group), **medians, "planning_ms": float(np.median(planning)),
             "planning_ms_p95": float(np.quantile(planning, 0.95)), "planning_ms_max": max(planning),
         })  # fmt: skip
     return table

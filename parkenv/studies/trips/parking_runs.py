@@ -1,33 +1,40 @@
-"""Run parking episodes and summarise them in a table."""
+"""Parking by the planner on lots: its episodes, their table, pictures and a film."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
-from scipy.stats import binomtest
 
 from parkenv.driving.drive_state import DriveState
 from parkenv.driving.vehicle import STEERING, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
 from parkenv.files.csv_tables import write_csv
+from parkenv.show.figures.manoeuvres import save_sheet
+from parkenv.show.figures.picture_files import save_film
+from parkenv.show.frames.drive import DriveRenderer
+from parkenv.studies.results import Row
 from parkenv.studies.simulate import FrameRecorder, Observer, Step, simulate
+from parkenv.studies.statistics import success_columns
+from parkenv.studies.study import Progress
 from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
 from planners.driving.parking import ParkingAgent, ParkingMemory
 
 CHUNK = 25  # episodes per task of a worker
+SHOWN_FAILURES = 6
+PLANNER = ParkingAgent.name
 
 
 @dataclass(frozen=True)
 class ParkingCase:
-    """A parking task distribution on one lot."""
+    """A distribution of parking tasks on one lot."""
 
     lot: ParkingLot
     kinds: tuple[str, ...] | None = None  # kinds of slots; None for all kinds on the lot
@@ -37,52 +44,32 @@ class ParkingCase:
     vehicle: VehicleParameters = field(default_factory=VehicleParameters)
 
     def environment(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
-        """Make `parkenv/Drive-v1` with the obstacle map."""
-        return gym.make(
-            "parkenv/Drive-v1",
-            lot=self.lot,
-            kinds=self.kinds,
-            ways=self.ways,
-            occupancy=self.occupancy,
-            slack=self.slack,
-            vehicle=self.vehicle,
-            obstacle_map=True,
-            render_mode=render_mode,
-            disable_env_checker=True,
-        )
+        options: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        options |= {"obstacle_map": True, "render_mode": render_mode, "disable_env_checker": True}
+        return gym.make("parkenv/Drive-v1", **options)
 
 
-@dataclass
-class Parking:
-    """Result of one parking episode."""
+class Parking(NamedTuple):
+    """The result of one parking episode."""
 
-    row: dict[str, Any]  # metrics of the episode
+    row: Row  # metrics of the episode
     state: DriveState  # final state of the episode, with the driven trail
-    frames: list[Any] = field(default_factory=list)  # rendered frames, if requested
+    frames: list[Any] = []  # noqa: RUF012 - never changed; rendered frames, if requested
 
 
 class _MotionRecorder(Observer):
-    """Record steering angle and heading at the start and after every step."""
-
-    def __init__(self) -> None:
-        self.steering: list[float] = []
-        self.yaws: list[float] = []
+    """Steering angle and heading at the start and after every step."""
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Record the start."""
-        del observation
-        self.drive = cast(DriveEnv, env.unwrapped)
+        self.drive, self.motion = cast("DriveEnv", env.unwrapped), list[tuple[float, float]]()
         self._record()
 
     def on_step(self, step: Step) -> None:
-        """Record the step."""
-        del step
         self._record()
 
     def _record(self) -> None:
         vehicle = self.drive.state.vehicle
-        self.steering.append(float(vehicle[STEERING]))
-        self.yaws.append(float(vehicle[YAW]))
+        self.motion.append((float(vehicle[STEERING]), float(vehicle[YAW])))
 
 
 def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0) -> Parking:
@@ -97,16 +84,14 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
     Returns:
         A row with lot, seed, kind, way, slot, parked, reason (of a failure), contact (what was touched), time_s,
         driven_m, direction_changes, wheel_rad and turned_rad (total change of steering angle and heading),
-        position_error_m,
-        angle_error_deg; for a planner also plans, planning_s (all plans), path_m, expansions, margin_m.
+        position_error_m, angle_error_deg; for a planner also plans, planning_s (all plans), path_m, expansions,
+        margin_m.
     """
     recorder = _MotionRecorder()
     film = [FrameRecorder(every)] if every else []
     result = simulate(env, agent, seed, (recorder, *film))
-    info, memory, drive = result.info, result.memory, recorder.drive
-    state: DriveState = drive.get_state()[1]
-    task = state.task
-    reason = info["contact"] or ("" if info["is_success"] else "out of time")
+    info, memory, state = result.info, result.memory, recorder.drive.get_state()[1]
+    task, (wheel, heading) = state.task, zip(*recorder.motion, strict=True)
     row = {
         "lot": task.lot,
         "seed": seed,
@@ -114,12 +99,12 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         "way": task.way if task.kind != "parallel" else "",
         "slot": task.slot_id,
         "parked": bool(info["is_success"]),
-        "reason": reason,
+        "reason": info["contact"] or ("" if info["is_success"] else "out of time"),
         "contact": info["contact"],
         **{k: info[k] for k in ("time_s", "driven_m", "direction_changes", "position_error_m")},
         "angle_error_deg": float(np.degrees(info["angle_error_rad"])),
-        "wheel_rad": float(np.abs(np.diff(recorder.steering)).sum()),
-        "turned_rad": float(np.abs(np.diff(recorder.yaws)).sum()),
+        "wheel_rad": float(np.abs(np.diff(wheel)).sum()),
+        "turned_rad": float(np.abs(np.diff(heading)).sum()),
         "decision_ms": 1e3 * sum(result.decision_s) / result.steps,
     }
     if isinstance(memory, ParkingMemory):
@@ -138,19 +123,9 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
 
 
 def park_all(
-    cases: Sequence[ParkingCase],
-    seeds: Sequence[int],
-    workers: Workers = SERIAL,
+    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = SERIAL
 ) -> Iterator[list[Parking]]:
-    """Park with every seed of every case by the planner; yield the parkings in order.
-
-    Results do not depend on the number of workers; only wall times differ from run to run.
-
-    Args:
-        cases: the tasks.
-        seeds: seeds of the tasks.
-        workers: where the episodes run.
-    """
+    """Park with every seed of every case by the planner; yield the parkings in order, for any number of workers."""
     parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
     yield from workers.in_order([partial(_park_some, case, part) for case in cases for part in parts])
 
@@ -160,46 +135,81 @@ def _park_some(case: ParkingCase, seeds: Sequence[int]) -> list[Parking]:
     return [park_once(env, agent, seed) for seed in seeds]
 
 
-def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def parking_table(rows: Sequence[Row]) -> list[Row]:
     """Summarise parkings: one row per kind of slot and way of parking, and one for all (`kind` "all").
 
     Returns:
         kind, way, episodes, parked, success and its 95 % interval (Wilson), contacts; median and p95 of planning_ms
         (the first plan), time_s and direction_changes; means of driven_m, wheel_rad, turned_rad.
     """
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["kind"], row["way"]), []).append(row)
     table = [_summary(kind, way, groups[kind, way]) for kind, way in sorted(groups)]
     return [*table, _summary("all", "", rows)] if rows else []
 
 
-def write_parkings(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write rows of parkings as CSV, atomically."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    write_csv(path, columns, rows)
-
-
-def _summary(kind: str, way: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _summary(kind: str, way: str, rows: Sequence[Row]) -> Row:
     parked = [row for row in rows if row["parked"]]
-    interval = binomtest(len(parked), len(rows)).proportion_ci(0.95, "wilson")
-    summary: dict[str, Any] = {
-        "kind": kind,
-        "way": way,
-        "episodes": len(rows),
-        "parked": len(parked),
-        "success": len(parked) / len(rows),
-        "success_ci95": [float(interval.low), float(interval.high)],
-        "contacts": sum(bool(row["contact"]) for row in rows),
-    }
     columns = {
         "planning_ms": [1e3 * row["first_planning_s"] for row in rows if "first_planning_s" in row],
         "time_s": [row["time_s"] for row in parked],
         "direction_changes": [row["direction_changes"] for row in parked],
     }
+    quantiles: Row = {}
     for name, values in columns.items():
-        summary[name] = float(np.median(values)) if values else np.nan
-        summary[f"{name}_p95"] = float(np.quantile(values, 0.95)) if values else np.nan
-    for name in ("driven_m", "wheel_rad", "turned_rad", "position_error_m", "angle_error_deg"):
-        summary[name] = float(np.mean([row[name] for row in parked])) if parked else np.nan
-    return summary
+        quantiles[name] = float(np.median(values)) if values else np.nan
+        quantiles[f"{name}_p95"] = float(np.quantile(values, 0.95)) if values else np.nan
+    means = ("driven_m", "wheel_rad", "turned_rad", "position_error_m", "angle_error_deg")
+    return {
+        "kind": kind,
+        "way": way,
+        "episodes": len(rows),
+        "parked": len(parked),
+        **success_columns("success", len(parked), len(rows)),
+        "contacts": sum(bool(row["contact"]) for row in rows),
+        **quantiles,
+        **{name: float(np.mean([row[name] for row in parked])) if parked else np.nan for name in means},
+    }
+
+
+def park_on_lots(
+    cases: Sequence[ParkingCase],
+    seeds: Sequence[int],
+    folder: Path,
+    *,
+    workers: Workers = SERIAL,
+    progress: Progress = lambda *_: None,
+) -> tuple[list[Row], list[Row]]:
+    """Park with all seeds on all lots; write episodes.csv, pictures and a film into a folder.
+
+    Returns:
+        A row for each episode, and the `parking_table`.
+    """
+    for case in cases:
+        case.environment().close()
+    total, parkings = len(cases) * len(seeds), list[Parking]()
+    progress("Parking", 0, total)
+    for block in park_all(cases, seeds, workers):
+        parkings += block
+        progress("Parking", len(parkings), total)
+    rows = [{"agent": PLANNER, **p.row} for p in parkings]
+    write_csv(folder / "episodes.csv", list(dict.fromkeys(name for row in rows for name in row)), rows)
+    _draw(parkings, {case.lot.name: case for case in cases}, folder)
+    return rows, [{"agent": PLANNER, **row} for row in parking_table([p.row for p in parkings])]
+
+
+def _draw(parkings: Sequence[Parking], cases: dict[str, ParkingCase], folder: Path) -> None:
+    """Draw the first success of each kind of slot and way, failures, and a film of the success with most changes."""
+    first = {(p.row["kind"], p.row["way"]): p for p in reversed(parkings) if p.row["parked"]}
+    successes = [first[key] for key in sorted(first)]
+    failures = [p for p in parkings if not p.row["parked"]][:SHOWN_FAILURES]
+    for shown, name in ((successes, "parkings.png"), (failures, "failures.png")):
+        if shown:
+            frames = [DriveRenderer(cases[p.row["lot"]].lot).frame(p.state) for p in shown]
+            save_sheet(frames, folder / name)
+    if successes:
+        row = max((p.row for p in successes), key=lambda row: row["direction_changes"])
+        case = cases[row["lot"]]
+        env, agent = case.environment("rgb_array"), ParkingAgent(case.vehicle)
+        save_film(park_once(env, agent, row["seed"], every=2).frames, folder / "parking.gif", fps=10.0)

@@ -14,7 +14,7 @@ from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
 from parkenv.driving.parking_task import KINDS, ParkingTasks
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters
 from parkenv.envs.drive_observation import ANGLE_TOLERANCE, POSITION_TOLERANCE
-from parkenv.errors import InputError
+from parkenv.errors import ensure
 from parkenv.studies.trips.driven_car import (
     ACROSS,
     ALONG,
@@ -77,15 +77,15 @@ class VehicleController:
         self.style = style or DrivingStyle()
         self.car = DrivenCar(scenario, self.vehicle, self.style)
         speed = scenario.v_drive if self.style.speed is None else self.style.speed
-        if speed > self.vehicle.max_speed:
-            raise InputError(
-                f"the speed on lanes is {speed:g} m/s, want at most {self.vehicle.max_speed:g}, the car's own"
-            )
+        ensure(
+            speed <= self.vehicle.max_speed,
+            f"the speed on lanes is {speed:g} m/s, want at most {self.vehicle.max_speed:g}, the car's own",
+        )
         others = scenario.traffic.cars + scenario.traffic.pedestrians
-        if others > MOST_ROAD_USERS:
-            raise InputError(
-                f"traffic has {others} cars and pedestrians; a driven trip takes at most {MOST_ROAD_USERS}"
-            )
+        ensure(
+            others <= MOST_ROAD_USERS,
+            f"traffic has {others} cars and pedestrians; a driven trip takes at most {MOST_ROAD_USERS}",
+        )
         lot = scenario.lot
         self._lines = DrivenLines(lot)
         self._kinds = ParkingTasks(lot).slot_kinds
@@ -95,13 +95,11 @@ class VehicleController:
         self._turns: dict[tuple[int, int, int, int], CarPath | None] = {}
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
-        """Start at a vertex at full speed, at a time in s, in the world with this key."""
         self.car.begin(key, world, vertex, time)
         self._line: int | None = None
         self._placed = False
 
     def drive(self, source: int, column: int) -> float:
-        """Drive along an edge of the graph to its end; return the time taken, s."""
         lot = self.scenario.lot
         target, length = int(lot.neighbors[source, column]), float(lot.edge_length[source, column])
         edge = self._lines.edge(source, target, length)
@@ -148,7 +146,6 @@ class VehicleController:
         return result
 
     def wait(self, seconds: float) -> float:
-        """Brake, and stand for some time; return the time taken, s."""
         until, self.car.track = self.car.time + seconds, []
         self.car.refresh()
         while self.car.time < until - 1e-9:
@@ -158,14 +155,12 @@ class VehicleController:
     # --- Lanes
 
     def _place(self, edge: DrivenEdge) -> None:
-        """Place the car at the start of the first edge."""
         self.car.place(
             self._lines.lines[edge.line].pose(edge.start - self.vehicle.middle), self._on_lane.speed
         )
         self._placed = True
 
     def _plan_edge(self, edge: DrivenEdge) -> str:
-        """Plan the path along an edge from the car's pose; return the edge's kind."""
         if self._line == edge.line and self.car.path is not None and not self.car.path.done:
             return ALONG
         line = self._lines.lines[edge.line]
@@ -220,7 +215,6 @@ class VehicleController:
         return joined(rounded(here.between(now, leave), _BEND_M), path)
 
     def _turn_onto(self, line: DrivenLine) -> str:
-        """Drive from the car's pose onto a line, and continue along it; return the edge's kind."""
         self.car.halt(self.style.braking)
         askew = 0.0
         for _ in range(_MOST_PLANS):
@@ -277,7 +271,6 @@ class VehicleController:
         return None if best is None else best[1]
 
     def _keep_lane(self) -> bool:
-        """Drive one control step along the lane; return False at its end."""
         assert self.car.path is not None
         pose, speed, steering = self.car.pose, float(self.car.state[SPEED]), float(self.car.state[STEERING])
         command = self.car.path.command(pose, speed, steering)
@@ -304,7 +297,6 @@ class VehicleController:
         return bool(ahead >= (0.0 if slot else -TURN_IN_M))
 
     def _is_on(self, line: DrivenLine) -> bool:
-        """Return whether the car is aligned with a line."""
         pose = line.pose(line.station_of(self.car.state[:2]))
         return _away(pose, self.car.pose) < _NEAR_M and _askew(pose, self.car.pose) < _ALIGNED
 
@@ -336,7 +328,6 @@ class VehicleController:
         return way, NO_WAY
 
     def _noticing(self, tracker: PathTracker, inside: FloatArray) -> Callable[[], bool]:
-        """Return a function that checks whether the path meets an outline within `notice_m`."""
         body = shapely.Polygon(inside)
         ahead = np.arange(0.0, self.style.notice_m + _NOTICE_STEP, _NOTICE_STEP)
 
@@ -347,7 +338,6 @@ class VehicleController:
         return notices
 
     def _planned_to(self, target: FloatArray, there: Obstacles) -> CarPath | None:
-        """Plan a path to a pose of the footprint's centre."""
         goal = self.vehicle.at_rear_axle(target)
         return plan_path(self.vehicle, there.corners, there.n_corners, self.car.pose, goal)
 
@@ -389,13 +379,11 @@ class VehicleController:
 
 
 def _with(there: Obstacles, outline: FloatArray) -> Obstacles:
-    """Add a parked car to obstacles."""
     things = [(ObstacleKind(t), o) for t, o in zip(there.kind.tolist(), there.outlines(), strict=True)]
     return Obstacles.of([*things, (ObstacleKind.PARKED_CAR, outline)])
 
 
 def _seconds_of(path: CarPath) -> float:
-    """Estimate the time of a manoeuvre along a path, s."""
     changes = path.direction_changes + (len(path.length) > 0 and path.length[0] < 0.0)
     return path.driven_m / TYPICAL_SPEED + _CHANGE_S * changes
 

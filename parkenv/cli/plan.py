@@ -1,39 +1,21 @@
-"""`parkenv compare`: compare agents in the same worlds; `parkenv plan`: what the thesis's planner intends."""
+"""`parkenv plan`: what the thesis's planner intends."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
 from pydantic import Field
 
-from parkenv.cli.options import Command, Given
-from parkenv.cli.study_command import StudyCommand
+from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, print_rows, save_summary
+from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.columns import SETTING_AXES
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import Grid
 from parkenv.studies.fields import TRAFFIC, OneAgent, OneScenario, Seed
-
-
-class Compare(StudyCommand):
-    """A comparison, which may use the largest lots only."""
-
-    largest: int | None = option(
-        None, "Use only the scenarios with the N largest lots.", panel="World", default="all", ge=1
-    )
-
-    @classmethod
-    def of(cls, given: Given) -> Self:
-        command = super().of(given)
-        if command.largest is None:
-            return command
-        from parkenv.scenarios.build import largest_lots
-
-        scenarios = largest_lots(command.study.scenarios, command.largest)  # type: ignore[attr-defined]
-        return command.changed(study=command.study.changed(scenarios=tuple(scenarios)))
 
 
 class Plan(Command):
@@ -57,17 +39,18 @@ class Plan(Command):
     out: Path = option(Path("results/plan"), "Folder for plan.png and summary.json.", short="-o")
 
     def run(self) -> None:
-        from parkenv.files.atomic_write import make_folder
         from parkenv.scenarios.build import build
         from parkenv.show.figures.picture_files import save_picture
         from parkenv.show.figures.searches import draw_searches
-        from parkenv.studies.compare.plans import plan_searches
+        from parkenv.studies.compare.cases import plan_searches, settings_of
 
         console = make_console()
+        grid = self.grid
         with console.status("Planning"):
-            rows, traces = plan_searches(build(self.scenario), self.agent, self.grid, self.seed)
+            settings = settings_of(build(self.scenario), grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh)
+            rows, searches = plan_searches(settings, self.agent, self.seed)
             make_folder(self.out)
-            save_picture(draw_searches(traces), self.out / "plan.png")
+            save_picture(draw_searches(searches), self.out / "plan.png")
         save_summary(self.out, self.seed, rows)
         title = f"{self.scenario.title}: plans of {self.agent.label}, seed {self.seed}"
         print_rows(

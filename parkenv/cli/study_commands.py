@@ -1,0 +1,180 @@
+"""Commands of studies that have options besides the fields of the study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+from parkenv.cli.options import Given
+from parkenv.cli.report import make_report
+from parkenv.cli.study_command import StudyCommand
+from parkenv.cli.tables import make_console, print_rows, save_summary, stages, writing_into
+from parkenv.files.field_types import Probability
+from parkenv.files.option import Inside, option, words_in
+from parkenv.files.spec_file import Axis
+from parkenv.scenarios.spec import scenario_spec
+from parkenv.show.plurals import plural
+from parkenv.studies.demo.study import FILM, QUICK
+from parkenv.studies.demo.study import Demo as DemoStudy
+from parkenv.studies.fields import Scenarios
+from parkenv.studies.results import PAGE
+from parkenv.studies.sensing.survey_study import SHOWN, SurveyStudy
+from parkenv.studies.study import ReportOptions
+from parkenv.studies.trips.manoeuvre_study import ManoeuvreStudy
+
+if TYPE_CHECKING:
+    from parkenv.studies.runner import Result
+
+
+class Compare(StudyCommand):
+    """A comparison, which may use the largest lots only."""
+
+    largest: int | None = option(
+        None, "Use only the scenarios with the N largest lots.", panel="World", default="all", ge=1
+    )
+
+    @classmethod
+    def of(cls, given: Given) -> Self:
+        command = super().of(given)
+        if command.largest is None:
+            return command
+        from parkenv.scenarios.build import largest_lots
+
+        scenarios = largest_lots(command.study.scenarios, command.largest)  # type: ignore[attr-defined]
+        return command.changed(study=command.study.changed(scenarios=tuple(scenarios)))
+
+
+class Survey(StudyCommand):
+    """A survey, which may also record its first session."""
+
+    record: Path | None = option(
+        None,
+        "Also record images, scans and poses of the first session (extra bags), for `parkenv map-drive`.",
+        takes="FILE.mcap",
+        panel="Results",
+        default="none",
+    )
+
+    def run(self) -> None:
+        if self.record is None:
+            self.run_study()
+            return
+        from parkenv.mapping.recorded_drive import record_drive, require_recordable
+
+        require_recordable(self.record)
+        self.run_study()
+        console, study = make_console(), self.study
+        assert isinstance(study, SurveyStudy)
+        with console.status(f"Driving the first session once more for {self.record}"):
+            record_drive(study.survey, 0, self.record)
+        again = f"parkenv map-drive {self.record} --scenario {study.scenario.argument}"
+        console.print(f"Recorded: {self.record}; map it with: {again}")
+
+
+NEXT = (
+    (
+        "parkenv compare --scenario jam --agents mdp,belief,oracle --episodes 40 --report",
+        "another lot, where the forecast is wrong; many more searches, without images",
+    ),
+    ("parkenv plan --scenario jam --failure-cost 10,90", "what the thesis's planner intends, in a picture"),
+)
+
+
+class Demo(StudyCommand):
+    """The demo, which also writes its report, and says what to look at."""
+
+    quick: bool = option(
+        False,
+        "A shorter demo: fewer drives and episodes, captures farther apart.",
+        sets={"study": DemoStudy().changed(**QUICK)},
+    )
+    report: bool = option(True, "Write report.html.", panel="Results")
+
+    def run(self) -> None:
+        out = self.run_study().folder
+        console = make_console(soft_wrap=True)
+        console.print("\nOpen")
+        if self.report:
+            console.print(f"  {out / PAGE}\n    the results on one page, with replays, in a browser")
+        console.print(f"  {out / FILM}\n    a film of one search\n\nTry next")
+        for command, explained in NEXT:
+            console.print(f"  {command}\n    {explained}")
+
+    def write_report(self, result: Result) -> Path:
+        shown = result.results.kept.get(SHOWN)
+        options = ReportOptions(drives=None if shown is None else [shown[1]])
+        return make_report(result.folder, self.study, options, stage="Report")
+
+
+SHOWN_ROWS = 20
+SHOWN_OF_PARKINGS = (
+    "agent", "kind", "way", "parked", "success", "contacts", "planning_ms", "planning_ms_p95", "time_s", "time_s_p95",
+    "direction_changes", "direction_changes_p95", "driven_m", "turned_rad",
+)  # fmt: skip
+"""Columns of parkings on lots that are printed."""
+_TASKS = "Parking tasks"
+
+
+def _all_or(text: str) -> object:
+    return None if text in ("all", "both") else words_in(text)
+
+
+class Park(StudyCommand):
+    """Parking in scenes, a study, or on lots."""
+
+    scenarios: Annotated[Scenarios, Inside(only=())] = (scenario_spec("campus"), scenario_spec("street"))
+    kinds: Axis[Literal["perpendicular", "oblique", "parallel"]] | None = option(
+        None,
+        "Slots: perpendicular, oblique, parallel.",
+        name="--kind",
+        panel=_TASKS,
+        takes="NAME[,...]|all",
+        default="all",
+        parse=_all_or,
+    )
+    ways: Axis[Literal["nose-in", "back-in"]] | None = option(
+        None,
+        "Orientation in the slot: nose-in, back-in.",
+        name="--way",
+        panel=_TASKS,
+        takes="NAME|both",
+        default="both",
+        parse=_all_or,
+    )
+    occupied: Probability = option(
+        0.85, "Fraction of the other slots that are taken.", takes="P", panel=_TASKS
+    )
+
+    def run(self) -> None:
+        study = self.study
+        assert isinstance(study, ManoeuvreStudy)
+        if study.cases is not None or study.levels is not None:
+            self.run_study()
+        else:
+            self._park_on_lots(study, self.out or study.folder({}))
+
+    def _park_on_lots(self, study: ManoeuvreStudy, out: Path) -> None:
+        from parkenv.driving.parking_task import WAYS
+        from parkenv.driving.vehicle import VehicleParameters
+        from parkenv.scenarios.build import build
+        from parkenv.studies.trips.parking_runs import PLANNER, ParkingCase, park_on_lots
+
+        vehicle = study.vehicle or VehicleParameters()
+        cases = [
+            ParkingCase(build(spec).lot, self.kinds, self.ways or WAYS, self.occupied, vehicle=vehicle)
+            for spec in self.scenarios
+        ]
+        seeds = range(study.seed, study.seed + study.episodes)
+        console = make_console()
+        with writing_into(out):
+            with stages(console, "episodes") as progress, study.workers() as workers:
+                rows, table = park_on_lots(cases, seeds, out, workers=workers, progress=progress)
+            names = [case.lot.name for case in cases]
+            save_summary(out, study.seed, table, lots=names, agents={PLANNER: PLANNER})
+        title = f"{', '.join(names)}, {plural(study.episodes, 'episode')} per lot"
+        print_rows(console, title, table, SHOWN_OF_PARKINGS, study.columns)
+        for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
+            console.print(
+                f"failed: {row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
+            )
+        console.print(f"Episodes, summary and pictures are in {out}")
