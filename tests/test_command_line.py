@@ -58,7 +58,7 @@ def test_a_help_page_says_what_a_newcomer_needs(path, command, monkeypatch):
 
 
 OPTIONAL = (
-    "address", "agents", "beside", "bounds", "calibrated", "car_park", "clone", "crops", "drives", "lot",
+    "address", "agents", "around", "bounds", "calibrated", "car_park", "clone", "crops", "drives", "lot",
     "constant_forecast", "model", "labels", "picture", "replay", "rig", "simulated", "uiuc",
 )  # fmt: skip
 """Options that do nothing unless they are given."""

@@ -76,7 +76,7 @@ def test_the_local_observation_by_name_is_that_of_the_wrapper(name):
 
 @pytest.mark.parametrize("mode", ["sync", "async", "vector_entry_point"])
 @pytest.mark.parametrize("observation", ["full", "occupancy", "local"])
-def test_batches_of_every_kind_have_the_observations(mode, observation):
+def test_batches_of_every_kind_have_the_observations_and_a_closed_one_none(mode, observation):
     envs = gym.make_vec("parkenv/Search-v2", 2, mode, scenario="mini", observation=observation)
     one = gym.make("parkenv/Search-v2", scenario="mini", observation=observation)
     batch, single = envs.reset(seed=4)[0], one.reset(seed=4)[0]
@@ -84,6 +84,9 @@ def test_batches_of_every_kind_have_the_observations(mode, observation):
     for key, value in single.items():
         np.testing.assert_array_equal(batch[key][0], value)
     envs.close()
+    if mode == "vector_entry_point":
+        with pytest.raises(ResetNeeded):
+            envs.step(np.zeros(2, int))
 
 
 def test_a_copy_of_a_state_holds_the_local_observation():
@@ -118,14 +121,6 @@ def test_calls_out_of_order_are_refused(name):
     env.step(action)
 
 
-def test_a_closed_batch_has_no_episodes():
-    envs = gym.make_vec("parkenv/Search-v2", 2, "vector_entry_point", **OPTIONS["parkenv/Search-v2"])
-    envs.reset(seed=0)
-    envs.close()
-    with pytest.raises(ResetNeeded):
-        envs.step(np.zeros(2, int))
-
-
 @EVERY_LOT
 def test_a_lot_has_no_cars_before_it_begins_and_after_its_end(make):
     env = make(scenario="mini", cars=2)
@@ -143,17 +138,19 @@ def test_a_lot_has_no_cars_before_it_begins_and_after_its_end(make):
         env.step(act)
 
 
-@EVERY_LOT
-@pytest.mark.parametrize("seed", [1.5, -1, "1", True])
-def test_the_seed_of_a_lot_is_a_whole_number(make, seed):
-    with pytest.raises(InputError, match="seed is"):
-        make(scenario="mini", cars=2).reset(seed=seed)
-
-
-@pytest.mark.parametrize("seed", [1.5, -1, [1.5, 2], [1, -2]])
-def test_the_seeds_of_a_batch_are_whole_numbers(seed):
-    with pytest.raises(InputError, match="seed is"):
-        gym.make_vec("parkenv/Search-v2", 2, scenario="mini").reset(seed=seed)
+@pytest.mark.parametrize(
+    ("make", "seeds"),
+    [
+        (lambda: lot_v0.raw_env(scenario="mini", cars=2), (1.5, -1, "1", True)),
+        (lambda: lot_v0.parallel_env(scenario="mini", cars=2), (1.5, -1, "1", True)),
+        (lambda: gym.make_vec("parkenv/Search-v2", 2, scenario="mini"), (1.5, -1, [1.5, 2], [1, -2])),
+    ],
+)
+def test_seeds_are_whole_numbers(make, seeds):
+    env = make()
+    for seed in seeds:
+        with pytest.raises(InputError, match="seed is"):
+            env.reset(seed=seed)
 
 
 def test_an_empty_name_is_not_the_working_folder(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import ran, summary_of
 from gymnasium.utils.env_checker import check_env
 from small_trainings import make_small, search_training
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
@@ -62,11 +62,9 @@ def test_names_files_folders_and_sequences_of_them_are_scenarios(folder):
     # Experiment files and the command line say it in the same way.
     spec = Comparison.parse({"scenarios": ["mini", "."]}, "test", folder)
     assert [one.title for one in spec.scenarios] == ["mini", *in_folder]
-    done = parkenv("compare", "--scenario", f"mini,{folder}", "--agents", "first-free", "-n", 1, "--jobs", 1,
-                   "--occupancy-levels", "none", "--no-figures", "--out", folder / "out")  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    rows = json.loads((folder / "out" / "summary.json").read_text())["rows"]
-    assert [row["scenario"] for row in rows] == ["mini", *in_folder]
+    options = "--agents first-free -n 1 --jobs 1 --occupancy-levels none --no-figures --out"
+    ran("compare", "--scenario", f"mini,{folder}", *options.split(), folder / "out")
+    assert [row["scenario"] for row in summary_of(folder / "out")["rows"]] == ["mini", *in_folder]
 
 
 def test_a_lot_alone_is_a_scenario_with_days(folder):
@@ -97,28 +95,19 @@ def test_a_lot_without_goal_or_entry_says_how_to_give_them(folder, kind):
         assert "\n" not in message
 
 
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
+def test_what_is_no_scenario_is_refused_in_a_line(folder, tmp_path_factory):
+    (folder / "bad.toml").write_text('lot = "lot0.geojson"\ngoal = -1\n')
+    for source, message in (
         ("nowhere", "unknown scenario 'nowhere', and no such file"),
         ([], "scenario is an empty sequence"),
         (["mini", 3], "scenario is a int, want a Scenario"),
         (["mini", "none.geojson"], r"none\.geojson: lot\.file is 'none\.geojson', want a file; there"),
-    ],
-)
-def test_what_is_no_scenario_is_refused_in_a_line(source, message):
-    with pytest.raises(InputError, match=message) as caught:
-        make_scenarios(source)
-    assert "\n" not in str(caught.value)
-
-
-def test_files_in_a_folder_are_named_by_their_faults(folder, tmp_path_factory):
-    (folder / "bad.toml").write_text('lot = "lot0.geojson"\ngoal = -1\n')
-    with pytest.raises(InputError, match=r"bad\.toml: goal is -1, want the index"):
-        make_scenarios(folder)
-    empty = tmp_path_factory.mktemp("empty")
-    with pytest.raises(InputError, match=r"holds no scenario \(\.toml\) and no lot \(\.geojson\)"):
-        make_scenarios(empty)
+        (folder, r"bad\.toml: goal is -1, want the index"),
+        (tmp_path_factory.mktemp("empty"), r"holds no scenario \(\.toml\) and no lot \(\.geojson\)"),
+    ):
+        with pytest.raises(InputError, match=message) as caught:
+            make_scenarios(source)
+        assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="holds 5 scenarios, want one"):
         scenario_spec("parkenv/lots/packaged")
     with pytest.raises(InputError, match="scenario has 6 scenarios, want one"):
@@ -202,13 +191,11 @@ def test_states_and_pickles_keep_the_place():
         env.reset()
     env.set_state(state)
     assert env.scenario.name == copied.scenario.name == before
-    for action in (0, 1, 2, 3, 4):
-        ours, theirs = env.step(action), copied.step(action)
-        for name, value in ours[0].items():
-            np.testing.assert_array_equal(value, theirs[0][name])
-        assert ours[1:] == theirs[1:]
-        if ours[2]:
-            break
+    for action in range(4):
+        (observation, *results), (expected, *others) = env.step(action), copied.step(action)
+        for name, value in expected.items():
+            np.testing.assert_array_equal(observation[name], value)
+        assert results == others
     alone = gym.make("parkenv/Search-v2", scenario=PLACES[0]).unwrapped
     alone.reset(seed=0)
     with pytest.raises(InputError, match="state is of"):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from parkenv import InputError, SensorBand, SensorModel, Traffic, make_scenario
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.sensing.sensor_model_fit import BAND_ENDS, count_observations, fitted_model
+from parkenv.studies.sensing.simulated_sensors import BAND_ENDS, count_observations, fitted_model
 from parkenv.world.lot import PARK
 from parkenv.world.sensor_model import SENSOR_MODEL_NAMES
 from planners import make_agent

@@ -1,5 +1,6 @@
 """Stopped runs leave no process at work and keep what is finished, to be resumed; a folder has one writer."""
 
+import contextlib
 import errno
 import json
 import multiprocessing
@@ -36,99 +37,45 @@ GONE_S = 5.0
 """Time until no process of a stopped run is left."""
 
 
-class Run:
-    """`COMMAND`, which runs in processes of its own, as in a terminal."""
-
-    def __init__(self, out):
-        self.mark = f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "parkenv", *COMMAND.split(), "--jobs", "2", "--out", out],
-            env=os.environ | dict([self.mark.split("=")]),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-            # A shell's background jobs, and what they start, ignore Ctrl-C.
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-        )
-
-    def wait_for_entry(self):
-        """Wait until the entry point runs, or the process has ended: until then, Ctrl-C ends Python with a traceback.
-
-        Python catches SIGINT from its start. The entry point, after the import of the package and thus of NumPy, gives
-        it back to the system; the command then catches it with SIGTERM.
-        """
-        of_process, deadline = Path(f"/proc/{self.process.pid}"), time.monotonic() + 60.0
-        while self.process.poll() is None:
-            caught = int(of_process.joinpath("status").read_text().partition("SigCgt:")[2].split()[0], 16)
-            by_python, by_command = (caught >> (n - 1) & 1 for n in (signal.SIGINT, signal.SIGTERM))
-            if (by_command or not by_python) and "/numpy/" in of_process.joinpath("maps").read_text():
-                return
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
-
-    def stop(self, number):
-        """Send a signal; Ctrl-C goes to all processes of the terminal. Return exit code, output, errors."""
-        if number == signal.SIGINT:
-            self.wait_for_entry()
-        (os.killpg if number == signal.SIGINT else os.kill)(self.process.pid, number)
-        sent = time.monotonic()
-        while living := self.processes():
-            if time.monotonic() > sent + GONE_S:
-                for pid in living:
-                    os.kill(pid, signal.SIGKILL)
-                raise AssertionError(
-                    f"{living} at work {GONE_S} s after {number!r}: {self.process.communicate()}"
-                )
-            time.sleep(0.05)
-        output, errors = self.process.communicate()
-        return self.process.returncode, output, errors
-
-    def processes(self):
-        """Return the living processes that this run has started."""
-        living = []
-        for environment in Path("/proc").glob("[0-9]*/environ"):
-            try:
-                if self.mark.encode() in environment.read_bytes():
-                    living.append(int(environment.parent.name))
-            except OSError:
-                pass
-        return living
-
-
-def has_bytes(path, count):
-    deadline = time.monotonic() + 60.0
-    while not (path.exists() and path.stat().st_size > count):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+def processes_with(mark):
+    """Return the living processes with a variable in their environment."""
+    living = []
+    for environment in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):
+            if mark.encode() in environment.read_bytes():
+                living.append(int(environment.parent.name))
+    return living
 
 
 def test_a_stopped_command_leaves_no_process_and_says_how_to_go_on(tmp_path):
-    out = tmp_path / "out"
-    command = Run(out)
-    has_bytes(out / "results.sqlite-wal", 10_000)
-    code, output, errors = command.stop(signal.SIGTERM)
+    out, mark = tmp_path / "out", f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
+    command = subprocess.Popen(
+        [sys.executable, "-m", "parkenv", *COMMAND.split(), "--jobs", "2", "--out", out],
+        env=os.environ | dict([mark.split("=")]),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    stored, deadline = out / "results.sqlite-wal", time.monotonic() + 60.0
+    while not (stored.exists() and stored.stat().st_size > 10_000):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    command.send_signal(signal.SIGTERM)
+    deadline = time.monotonic() + GONE_S
+    while living := processes_with(mark):
+        if time.monotonic() > deadline:
+            os.killpg(command.pid, signal.SIGKILL)
+            raise AssertionError(f"{living} at work: {command.communicate()}")
+        time.sleep(0.05)
+    output, errors = command.communicate()
     assert "Traceback" not in errors
-    assert code == 143
+    assert command.returncode == 143
     assert f"parkenv run {out} --resume goes on" in " ".join(output.split())
     summary = json.loads((out / "summary.partial.json").read_text())
     kept = (out / "episodes.csv").read_text().splitlines()
     assert (summary["complete"], sum(row["episodes"] for row in summary["rows"])) == (False, len(kept) - 1)
-
-
-def test_ctrl_c_while_modules_are_imported_is_quiet(tmp_path):
-    """On a fast machine the command has begun its work at the last moment, and says where that is."""
-    outputs = []
-    for moment in (0.05, 0.6):
-        run = Run(tmp_path / "out")
-        run.wait_for_entry()
-        time.sleep(moment)
-        code, output, errors = run.stop(signal.SIGINT)
-        assert (code in (-signal.SIGINT, 130), errors) == (True, "")
-        assert output == "" or output.startswith(("Searching", "Interrupted."))
-        outputs.append(output)
-    assert "" in outputs, "none was stopped during imports"
 
 
 SIGNALLED = """

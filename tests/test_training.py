@@ -27,11 +27,10 @@ from parkenv.errors import InputError
 from parkenv.lots import grid_lot
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.runner import run
-from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import MAX_STEPS, SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.spec import TrainingSpec
-from parkenv.studies.training.training import TRAINING_SEEDS, episode_times
+from parkenv.studies.training.training import TRAINING_SEEDS, Demonstrations, clone, episode_times
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
 from planners.agent import make_agent
@@ -155,7 +154,7 @@ class Waits:
 
 
 def test_a_planner_that_finishes_nothing_cannot_be_cloned(monkeypatch):
-    monkeypatch.setattr("parkenv.studies.training.cloning.make_agent", lambda *_: Waits())
+    monkeypatch.setattr("parkenv.studies.training.training.make_agent", lambda *_: Waits())
     with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to clone"):
         Demonstrations.collect("waits", SCENARIO, [5_000_000])
 

@@ -21,14 +21,13 @@ from parkenv.lots import packaged_lot
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.selection import blind_scenario
 from parkenv.studies.simulate import Observer
-from parkenv.studies.trips.calibration import calibrate
 from parkenv.studies.trips.driven_car import (
     NO_ROOM,
     TAKEN,
     DrivingStyle,
     ParkingAttempt,
 )
-from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv
+from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv, calibrate
 from parkenv.studies.trips.vehicle_controller import VehicleController
 from parkenv.world.lot_scene import LotScenes
 from parkenv.world.traffic import Traffic

@@ -12,11 +12,12 @@ from pydantic import Field, model_validator
 from typer import Exit
 
 from parkenv.cli.options import Command
-from parkenv.cli.tables import make_console, print_rows, save_summary, stages, writing_into
+from parkenv.cli.tables import make_console, print_rows, save_summary, stages
 from parkenv.errors import InputError, ensure
 from parkenv.files.atomic_write import check_writable, write_together
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.file_names import file_name
+from parkenv.files.folder_lock import only_writer
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import Several, require
@@ -272,7 +273,7 @@ class Import(Command):
 
     def run(self) -> None:
         if self.split:
-            with writing_into(self.out):
+            with only_writer(self.out):
                 self._import_car_parks()
             return
         from parkenv.lots import import_lot, import_town, write_lot

@@ -1,23 +1,74 @@
-"""`parkenv report`: a page on a run, with replays; `parkenv play`: a page on which to search oneself."""
+"""`parkenv report` and `play`: pages on a run and of a game; and the trust that running a file's code needs."""
 
 from __future__ import annotations
 
+import sys
 import webbrowser
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated
 
+import typer
 from pydantic import Field
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, stages
-from parkenv.cli.trust import Trust, require_trust
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import make_folder
-from parkenv.files.option import Inside, option
+from parkenv.files.option import Inside, Option, option
+from parkenv.files.spec_file import Spec
+from parkenv.files.user_class import find_module
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.agent_spec import AgentSpec, classes_in
 from parkenv.studies.fields import TRAFFIC, Agents, OneScenario, Seed
 from parkenv.studies.study import ExecutionSpec, ReportOptions
+from planners.names import ALGORITHMS
+
+Trust = Annotated[
+    bool,
+    Option(panel="Trust"),
+    Field(
+        description="Run the classes (MODULE:CLASS) and use the cluster named by the file or the folder of "
+        "the run."
+    ),
+]
+TrustModel = Annotated[
+    bool,
+    Option(panel="Trust"),
+    Field(
+        description="Convert archives of stable-baselines3 (ALGORITHM:FILE.zip) to model files; this runs the code in "
+        "them."
+    ),
+]
+
+
+def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] = ()) -> None:
+    """Refuse a specification that names classes or a cluster in fields that are not given; ask in a terminal."""
+    classes = classes_in(spec, given)
+    named = [f"{name} ({find_module(name) or 'not found'})" for name in classes]
+    if "address" not in given and (address := getattr(spec, "address", None)):
+        # A cluster's answers are pickled objects.
+        named.append(f"tasks on the cluster at {address}")
+    if trust or not named:
+        return
+    shown = ", ".join(named)
+    if sys.stdin.isatty() and typer.confirm(f"{source} runs {shown}. Run this code?"):
+        return
+    raise InputError(f"{source}: would run {shown}; read that code, then add --trust")
+
+
+def readable_models(agents: Sequence[str]) -> list[str]:
+    """Return the agents, with archives of stable-baselines3 converted to model files; this runs the code in them."""
+    readable = list(agents)
+    for i, agent in enumerate(agents):
+        algorithm, _, file = agent.partition(":")
+        if algorithm in ALGORITHMS and file.endswith(".zip"):
+            from planners.model_file import convert_archive
+
+            converted = convert_archive(algorithm, file)
+            typer.echo(f"Converted: {converted}; from now on, name that file")
+            readable[i] = f"{algorithm}:{converted}"
+    return readable
 
 
 class Report(Command, ExecutionSpec, ReportOptions):

@@ -10,9 +10,8 @@ from pydantic import create_model
 from typer import echo
 
 from parkenv.cli.options import Command, Given, command_class, field_options, spec_of
-from parkenv.cli.report import make_report
+from parkenv.cli.report import Trust, TrustModel, make_report, readable_models, require_trust
 from parkenv.cli.tables import command_line, make_console, print_table, stages
-from parkenv.cli.trust import Trust, TrustModel, readable_models, require_trust
 from parkenv.errors import InputError, ensure, nearest
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Option, option
@@ -33,8 +32,6 @@ KINDS = ("scenario", *STUDIES)  # kinds of files that have a schema
 
 
 class RunCommand(Command):
-    """A command that runs a study into a folder."""
-
     out: Annotated[Path | None, Option(short="-o")] = None
     resume: bool = option(
         False,

@@ -1,22 +1,29 @@
-"""Commands of studies that have options besides the fields of the study."""
+"""Commands of studies that have options besides the fields of the study, and `parkenv plan`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-from parkenv.cli.options import Given
+from pydantic import Field
+
+from parkenv.cli.options import Command, Given
 from parkenv.cli.report import make_report
 from parkenv.cli.study_command import StudyCommand
-from parkenv.cli.tables import make_console, print_rows, save_summary, stages, writing_into
+from parkenv.cli.tables import make_console, print_rows, save_summary, stages
+from parkenv.files.atomic_write import make_folder
 from parkenv.files.field_types import Probability
+from parkenv.files.folder_lock import only_writer
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.show.columns import SETTING_AXES
 from parkenv.show.plurals import plural
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.compare.comparison import Grid
 from parkenv.studies.demo.study import FILM, QUICK
 from parkenv.studies.demo.study import Demo as DemoStudy
-from parkenv.studies.fields import Scenarios
+from parkenv.studies.fields import TRAFFIC, OneAgent, OneScenario, Scenarios, Seed
 from parkenv.studies.results import PAGE
 from parkenv.studies.sensing.survey_study import SHOWN, SurveyStudy
 from parkenv.studies.study import ReportOptions
@@ -27,8 +34,6 @@ if TYPE_CHECKING:
 
 
 class Compare(StudyCommand):
-    """A comparison, which may use the largest lots only."""
-
     largest: int | None = option(
         None, "Use only the scenarios with the N largest lots.", panel="World", default="all", ge=1
     )
@@ -45,8 +50,6 @@ class Compare(StudyCommand):
 
 
 class Survey(StudyCommand):
-    """A survey, which may also record its first session."""
-
     record: Path | None = option(
         None,
         "Also record images, scans and poses of the first session (extra bags), for `parkenv map-drive`.",
@@ -81,8 +84,6 @@ NEXT = (
 
 
 class Demo(StudyCommand):
-    """The demo, which also writes its report, and says what to look at."""
-
     quick: bool = option(
         False,
         "A shorter demo: fewer drives and episodes, captures farther apart.",
@@ -120,8 +121,6 @@ def _all_or(text: str) -> object:
 
 
 class Park(StudyCommand):
-    """Parking in scenes, a study, or on lots."""
-
     scenarios: Annotated[Scenarios, Inside(only=())] = (scenario_spec("campus"), scenario_spec("street"))
     kinds: Axis[Literal["perpendicular", "oblique", "parallel"]] | None = option(
         None,
@@ -166,7 +165,7 @@ class Park(StudyCommand):
         ]
         seeds = range(study.seed, study.seed + study.episodes)
         console = make_console()
-        with writing_into(out):
+        with only_writer(out):
             with stages(console, "episodes") as progress, study.workers() as workers:
                 rows, table = park_on_lots(cases, seeds, out, workers=workers, progress=progress)
             names = [case.lot.name for case in cases]
@@ -178,3 +177,47 @@ class Park(StudyCommand):
                 f"failed: {row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
             )
         console.print(f"Episodes, summary and pictures are in {out}")
+
+
+class Plan(Command):
+    """The picture shows the true occupancy (inner disc) and the forecast (outer ring) of each slot.
+
+    It also shows the planned action at each vertex (arrow), the path driven with replanning, and the walk.
+    """
+
+    examples = """
+        parkenv plan --scenario jam --failure-cost 10,90
+        parkenv plan --scenario campus --failure-cost 90 --v-walk-kmh 4,10
+        """
+
+    scenario: Annotated[OneScenario, Inside(without=TRAFFIC)] = scenario_spec("campus")
+    agent: OneAgent = Field(
+        AgentSpec(name="mdp"),
+        description="mdp or mdp-static, with any options in brackets: mdp(failure_s=90).",
+    )
+    seed: Seed = Field(0, description="Seed of the world.")
+    grid: Annotated[Grid, Inside(only=("--failure-cost", "--v-walk-kmh", "--v-drive-kmh"))] = Grid()
+    out: Path = option(Path("results/plan"), "Folder for plan.png and summary.json.", short="-o")
+
+    def run(self) -> None:
+        from parkenv.scenarios.build import build
+        from parkenv.show.figures.picture_files import save_picture
+        from parkenv.show.figures.searches import draw_searches
+        from parkenv.studies.compare.cases import plan_searches, settings_of
+
+        console = make_console()
+        grid = self.grid
+        with console.status("Planning"):
+            settings = settings_of(build(self.scenario), grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh)
+            rows, searches = plan_searches(settings, self.agent, self.seed)
+            make_folder(self.out)
+            save_picture(draw_searches(searches), self.out / "plan.png")
+        save_summary(self.out, self.seed, rows)
+        title = f"{self.scenario.title}: plans of {self.agent.label}, seed {self.seed}"
+        print_rows(
+            console,
+            title,
+            rows,
+            (*SETTING_AXES, "slot", "expected_s", "total_s", "driven_m", "walked_m", "replans"),
+        )
+        console.print(f"Picture and summary are in {self.out}")

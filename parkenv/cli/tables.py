@@ -174,18 +174,6 @@ def _show_compiling(progress: Progress, ended: Event) -> None:
         progress.update(line, visible=bool(names), description=text, completed=n_finished)
 
 
-@contextmanager
-def writing_into(out: Path) -> Iterator[None]:
-    from parkenv.files.folder_lock import only_writer
-
-    try:
-        with only_writer(out):
-            yield
-    except KeyboardInterrupt:
-        make_console().print("Interrupted.")
-        raise
-
-
 def command_line() -> list[str]:
     return ["parkenv", *sys.argv[1:]]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -74,15 +73,6 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
             }
         self._returns[done], self._lengths[done] = 0.0, 0
         return observations, (rewards * self.reward_scale).astype(np.float32), done, infos
-
-    def get_state(self) -> dict[str, Any]:
-        state = {"masks": self._masks, "returns": self._returns, "lengths": self._lengths}
-        return {"batch": self.batch.get_state()} | {name: array.copy() for name, array in state.items()}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        self.reset_infos = [{} for _ in range(self.num_envs)]
-        self.batch.set_state(state["batch"])
-        self._masks, self._returns, self._lengths = state["masks"], state["returns"], state["lengths"]
 
     def action_masks(self) -> NDArray[np.bool_]:
         return self._masks.astype(np.bool_)

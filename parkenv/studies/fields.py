@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -70,16 +71,17 @@ def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...
     return tuple(listed)
 
 
+def _only(items: Sequence[T], what: str) -> T:
+    ensure(len(items) == 1, f"names {len(items)} {what}, want one")
+    return items[0]
+
+
 def _one_car_park(scenario: ScenarioSpec) -> ScenarioSpec:
-    scenarios = _by_car_park((scenario,))
-    ensure(len(scenarios) <= 1, f"--car-park names {len(scenarios)} scenarios, want one")
-    return scenarios[0]
+    return _only(_by_car_park((scenario,)), "scenarios by --car-park")
 
 
 def one_word(text: str) -> str:
-    words = words_in(text)
-    ensure(len(words) <= 1, f"names {len(words)} scenarios, want one")
-    return words[0]
+    return _only(words_in(text), "scenarios")
 
 
 def _lots(text: str) -> list[ScenarioSpec]:
@@ -135,16 +137,10 @@ Agents = Annotated[
 ]
 
 
-def _one_agent(text: str) -> str:
-    names = split_agents(text)
-    ensure(len(names) == 1, f"names {len(names)} agents, want one")
-    return names[0]
-
-
 OneAgent = Annotated[
     AgentItem,
     Field(description="The agent that searches, with any options in brackets: mdp(failure_s=90)."),
-    Option("--agents", takes="NAME", parse=_one_agent),
+    Option("--agents", takes="NAME", parse=lambda text: _only(split_agents(text), "agents")),
 ]
 Seed = Annotated[int, Field(ge=0, lt=2**31, description="First seed; episode i uses seed + i."), Option()]
 

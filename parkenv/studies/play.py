@@ -23,8 +23,6 @@ from parkenv.world.scenario import Scenario
 
 
 class _Actions(Observer):
-    """Collects the actions of a search, a digit each."""
-
     taken = ""
 
     def on_step(self, step: Step) -> None:

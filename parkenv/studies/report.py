@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from pydantic import Field
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, ensure
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec, read_tables
@@ -58,25 +58,24 @@ class RunFolder:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        if not path.is_dir():
-            raise InputError(f"{path}: no such folder; want one that a command with --out wrote")
-        file = path / SUMMARY
+        file, wanted = path / SUMMARY, "want a folder that a command with --out wrote"
+        ensure(path.is_dir(), f"{path}: no such folder; {wanted}")
         if not file.exists():
-            if (path / SUMMARY_PARTIAL).exists() or (path / SETTINGS).exists():
-                raise InputError(
-                    f"{path}: holds a run that was interrupted; finish it (--resume), then report it"
-                )
-            raise InputError(f"{path}: holds no {SUMMARY}; want a folder that a command with --out wrote")
+            is_begun = (path / SUMMARY_PARTIAL).exists() or (path / SETTINGS).exists()
+            ensure(
+                not is_begun,
+                f"{path}: holds a run that was interrupted; finish it (--resume), then report it",
+            )
+            raise InputError(f"{path}: holds no {SUMMARY}; {wanted}")
         summary = read_json(file, finite=True)
-        if not isinstance(summary, dict):
-            raise InputError(f"{file}: want the summary of a command")
+        ensure(isinstance(summary, dict), f"{file}: want the summary of a command")
         damaged = f"{file}: is not as a command wrote it"
         Summary.parse(summary, damaged)
-        if summary["version"] != __version__:
-            raise InputError(
-                f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may "
-                "differ; run the command again, or report it with that version"
-            )
+        ensure(
+            summary["version"] == __version__,
+            f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may differ; "
+            "run the command again, or report it with that version",
+        )
         spec = path / SPEC_FILE
         kind = str((spec.exists() and read_tables(spec).get("kind")) or summary["command"][1])
         try:
@@ -84,33 +83,22 @@ class RunFolder:
                 page = study_class(kind).page(summary, path)
             else:
                 page = Page(f"parkenv {kind}", tables=tables_of(summary, {"rows": "Results"}))
-            return cls(path, summary, kind, page)
         except InputError:
             raise
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{damaged}: {error!r}") from error
+        return cls(path, summary, kind, page)
 
     def spec(self) -> Study | None:
         return read_study(self.path / SPEC_FILE) if self.kind in STUDIES else None
 
     @property
     def command(self) -> list[str]:
-        """The words of a command that repeats the run in a folder beside it."""
-        words = [
-            str(self.path / SPEC_FILE) if word == SPEC_FILE else str(word) for word in self.summary["command"]
-        ]
+        """The words of a command that repeats the run, in a folder beside it."""
         if self.kind not in STUDIES:
-            return words
-        if {"--resume", "--overwrite"} & set(words):
-            words = ["parkenv", "run", str(self.path / SPEC_FILE)]
-        out, path = ("--out", "-o"), self.path if self.path.name else self.path.resolve()
-        pairs = zip(words, ["", *words], strict=False)
-        others = [w for w, before in pairs if not {w, before} & {*out} and not w.startswith("--out=")]
-        return [*others, "--out", f"{path}-again"]
-
-    @property
-    def figures(self) -> list[Path]:
-        return sorted(self.path.glob("*.png"))
+            return list(map(str, self.summary["command"]))
+        path = self.path if self.path.name else self.path.resolve()
+        return ["parkenv", "run", str(self.path / SPEC_FILE), "--out", f"{path}-again"]
 
     def data(self, recordings: Sequence[Recording] = (), notes: Sequence[str] = ()) -> dict[str, Any]:
         return page_data(self.kind, self.page, {**self.summary, "command": self.command}, recordings, notes)
@@ -127,20 +115,9 @@ def write_report(
     progress: Progress = lambda *_: None,
     doing: str = "Running again",
 ) -> tuple[Path, list[str]]:
-    """Write the page on a run.
+    """Write the page on a run, for `report.html` in its folder unless `out` is given; return it, and all notes on it.
 
-    Args:
-        run: the run.
-        study: its study; None to replay nothing.
-        options: what to replay.
-        out: the page; None for `report.html` in the folder of the run.
-        notes: notes for the reader.
-        workers: where searches, drives and days run again.
-        progress: called as they finish.
-        doing: what `progress` is called with.
-
-    Returns:
-        The page, and all notes on it.
+    Searches, drives and days that `options` choose run again; nothing does without the run's study.
     """
     options = options or ReportOptions()
     path = out or run.path / PAGE
@@ -163,5 +140,5 @@ def write_report(
         recordings.append(recording)
         progress(doing, number, len(tasks))
     notes += [note for recording in recordings for note in recording.get("differences", ())]
-    write_page(run.data(recordings, notes), path, run.figures)
+    write_page(run.data(recordings, notes), path, sorted(run.path.glob("*.png")))
     return path, notes

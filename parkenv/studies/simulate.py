@@ -33,8 +33,6 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """The outcome of one episode."""
-
     seed: int  # seed of the world
     # `info` of the last step. A truncated search is charged the give-up penalty, see `charge_truncation`.
     info: dict[str, Any]

@@ -148,19 +148,14 @@ def rows_of(
 ) -> list[Row]:
     """Run searches without saving them, and return the `table` row of each agent.
 
-    Args:
-        agents: the agents.
-        scenarios: a scenario; or several, of which each seed draws one as the environment does.
-        seeds: one search each.
-        workers: where they run.
-        name: name of the scenarios in the rows; that of the first if absent.
+    Of several scenarios each seed draws one as the environment does; `name` stands for them in the rows.
     """
     several = [scenarios] if isinstance(scenarios, Scenario) else scenarios
     work: list[tuple[Case, Sequence[int]]] = []
-    for scenario, its in zip(several, seeds_by_scenario(seeds, len(several)), strict=True):
+    for scenario, drawn in zip(several, seeds_by_scenario(seeds, len(several)), strict=True):
         cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
         require_distinct(cases)
-        work += [(case, its[i : i + BLOCK]) for case in cases for i in range(0, len(its), BLOCK)]
+        work += [(case, drawn[i : i + BLOCK]) for case in cases for i in range(0, len(drawn), BLOCK)]
     episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
     for number, rows in workers.results([partial(case.run, block) for case, block in work]):
         episodes[work[number][0].label] += rows
@@ -212,15 +207,8 @@ def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
 def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]) -> list[Row]:
     """Return a row for every case with finished episodes, in order; differences are to the first agent.
 
-    `leads` says whether no other agent of the setting, the oracle apart, is shown to be faster (`_mark_leaders`).
-    If some agents plan for a given time, `planner` and `budget_ms` tell the two apart.
-    If some cases are blind, `blind` says which: no slot is observed before an attempt.
-    If `exact` or `bound` is among the agents, `gap_to_exact` and `gap_to_bound` are the relative excesses of an agent's
-    mean time over theirs.
-
-    Args:
-        cells: cases with the seeds of their episodes.
-        finished: rows of episodes, by `Case.key`.
+    If some agents plan for a given time, `planner` and `budget_ms` tell the two apart. If `exact` or `bound` is among
+    the agents, `gap_to_exact` and `gap_to_bound` are the relative excesses of an agent's mean time over theirs.
     """
     rows, cells = [], list(cells)
     by_setting: dict[tuple[Any, ...], list[tuple[Row, list[Row]]]] = {}
@@ -233,15 +221,15 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
         columns = case.columns
         setting = tuple(v for k, v in columns.items() if k != "agent")
         times = list(itertools.chain.from_iterable(decision_s(row) for row in episodes))
-        its = by_setting.setdefault(setting, [])
-        rows.append(summarize(columns, episodes, its[0][1] if its else None, times))
+        agents = by_setting.setdefault(setting, [])
+        rows.append(summarize(columns, episodes, agents[0][1] if agents else None, times))
         if timed:
             rows[-1] |= {"planner": case.planner, BUDGET: case.options.get(BUDGET)}
         if any(blind.values()):
             rows[-1]["blind"] = blind[case.scenario.name]
-        its.append((rows[-1], episodes))
-    for its in by_setting.values():
-        _mark_leaders(its)
+        agents.append((rows[-1], episodes))
+    for agents in by_setting.values():
+        _mark_leaders(agents)
     names = [c for c in SETTING_COLUMNS if c != "agent"]
     for least in ("exact", BOUND):
         optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == least}
@@ -252,33 +240,22 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
     return rows
 
 
-def _mark_leaders(its: Sequence[tuple[Row, list[Row]]]) -> None:
+def _mark_leaders(agents: Sequence[tuple[Row, list[Row]]]) -> None:
     """Set `leads` in the rows of a setting, given with their episodes.
 
     An agent leads unless the 95 % interval of its paired difference to the lowest mean lies above 0. Several lead where
     the searches cannot tell them apart. The oracle and the bound are no competitors.
     """
-    best = min(
-        (i for i in its if i[0]["agent"] not in UNBEATEN),
-        key=lambda i: float(i[0]["total_s"]),
-        default=its[0],
-    )
-    for row, episodes in its:
-        behind = paired_differences(episodes, best[1])
+    acting = [agent for agent in agents if agent[0]["agent"] not in UNBEATEN] or agents[:1]
+    _, best = min(acting, key=lambda agent: float(agent[0]["total_s"]))
+    for row, episodes in agents:
+        behind = paired_differences(episodes, best)
         shown = len(behind) >= LEAST_PAIRS and mean_interval(behind)[1] > 0.0
         row["leads"] = row["agent"] not in UNBEATEN and not shown
 
 
 def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float]) -> list[Row]:
-    """Bin episodes by the occupancy at arrival, and return their mean total times.
-
-    Args:
-        rows: episodes.
-        edges: ascending edges of the occupancy bins.
-
-    Returns:
-        Rows with agent, failure_cost_s, occupancy (the bin's mean), total_s, total_s_ci95, episodes.
-    """
+    """Return the mean total times of episodes in bins of the occupancy at arrival, which have ascending edges."""
     bins: dict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
         number = int(np.searchsorted(edges, row["occupancy"], side="right")) - 1
@@ -286,13 +263,7 @@ def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float])
             bins[row["agent"], row["failure_cost_s"], number].append(row)
     result = []
     for (agent, failure, _), inside in sorted(bins.items(), key=lambda item: item[0][1:]):
-        result.append(
-            {
-                "agent": agent,
-                "failure_cost_s": failure,
-                "occupancy": float(np.mean([r["occupancy"] for r in inside])),
-                "episodes": len(inside),
-                **columns_of("total_s", mean_interval([r["total_s"] for r in inside])),
-            }
-        )
+        occupancy = float(np.mean([r["occupancy"] for r in inside]))
+        row = {"agent": agent, "failure_cost_s": failure, "occupancy": occupancy, "episodes": len(inside)}
+        result.append(row | columns_of("total_s", mean_interval([r["total_s"] for r in inside])))
     return result

@@ -60,11 +60,9 @@ class ComparisonResults:
         return [n for n in names if n.removesuffix(BLIND) not in self.sweeps and n not in self.flat_forecasts]
 
     def rows_of(self, scenario: str) -> list[Row]:
-        """Return the table's rows of a scenario."""
         return [row for row in self.rows if row["scenario"] == scenario]
 
     def episodes_of(self, case: Case, seeds: Sequence[int]) -> list[Row]:
-        """Return the finished episodes of a case."""
         return [self.episodes[key] for seed in seeds if (key := case.key(seed)) in self.episodes]
 
 

@@ -26,8 +26,6 @@ SEARCHES, SENSED = 20, 4
 
 
 class Encounter(NamedTuple):
-    """Several agents in the same world."""
-
     cases: tuple[Case, ...]  # one per agent, all in one setting
     seed: int
 
@@ -35,12 +33,9 @@ class Encounter(NamedTuple):
 def search_replay(
     cases: Sequence[tuple[Case, Sequence[int]]], folder: Path, options: ReportOptions
 ) -> ReplayJob:
-    """Return the searches to run again; lots with too many slots are left out.
+    """Return the searches to run again, to compare their totals with those of the run in the folder, if it is there.
 
-    Args:
-        cases: cases, each with the seeds of its searches.
-        folder: folder of the run; totals are compared with those in `episodes.csv`, if it is there.
-        options: which searches.
+    Lots with too many slots are left out.
     """
     agents = options.chosen_agents([case.label for case, _ in cases])
     count = options.episodes
@@ -77,12 +72,11 @@ def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[E
     chosen: list[Encounter] = []
     count = 0
     for number in range(max((len(seeds) for _, seeds in cases), default=0)):
-        for its in settings.values():
-            present = tuple(case for case, seeds in its if number < len(seeds))
-            if not present or (chosen and count + len(present) > episodes):
-                continue
-            chosen.append(Encounter(present, its[0][1][number]))
-            count += len(present)
+        for in_setting in settings.values():
+            present = tuple(case for case, seeds in in_setting if number < len(seeds))
+            if present and (not chosen or count + len(present) <= episodes):
+                chosen.append(Encounter(present, in_setting[0][1][number]))
+                count += len(present)
     return chosen
 
 

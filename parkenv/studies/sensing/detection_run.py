@@ -35,8 +35,6 @@ know it."""
 
 
 class FoundCars(NamedTuple):
-    """The cars in images and videos."""
-
     images: int  # their number
     videos: list[Row]  # of each video: file, frames, seconds, fps, boxes, most_cars
     boxes: list[Row]  # rows of `boxes.csv`

@@ -20,6 +20,7 @@ from parkenv.mapping.survey_score import METHODS
 from parkenv.show.plurals import plural
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, MAP_FILE, SESSION_COLUMNS
+from parkenv.studies.statistics import success_columns
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, OccupancyModel
 from parkenv.world.scenario import Scenario
@@ -99,12 +100,13 @@ def summarize(scenario: Scenario, settings: SurveySettings, rows: Sequence[Row],
         "unknown_fraction": _mean(rows, "unknown_fraction"),
         "by_weather": {
             weather: {
-                "sessions": len(its),
-                "car_detection_rate": sum(r["found"] for r in its) / max(sum(r["parked"] for r in its), 1),
-                "slot_accuracy": _mean(its, "slot_accuracy"),
+                "sessions": len(drives),
+                "car_detection_rate": sum(r["found"] for r in drives)
+                / max(sum(r["parked"] for r in drives), 1),
+                "slot_accuracy": _mean(drives, "slot_accuracy"),
             }
             for weather in sorted({r["weather"] for r in rows})
-            for its in [[r for r in rows if r["weather"] == weather]]
+            for drives in [[r for r in rows if r["weather"] == weather]]
         },
         "detection_by_distance": detection_by_distance(rows),
         "slots_found": found._asdict(),
@@ -128,28 +130,22 @@ def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
     The rows have both ends of the bin in distance_m, and the rate with its 95 % interval (Wilson's), for every bin that
     holds a car.
     """
-    from scipy.stats import binomtest
-
     counts: dict[str, NDArray[np.int64]] = {}
     for row in rows:
-        found = np.array([[int(n) for n in str(row[c]).split()] for c in ("cars_in_frame", "cars_detected")])
-        counts[row["weather"]] = counts.get(row["weather"], 0) + found
-    result = []
-    for weather, (there, detected) in sorted(counts.items()):
-        for i, end in enumerate(DISTANCE_ENDS):
-            if there[i]:
-                test = binomtest(int(detected[i]), int(there[i])).proportion_ci(method="wilson")
-                result.append(
-                    {
-                        "weather": weather,
-                        "distance_m": [0.0 if i == 0 else DISTANCE_ENDS[i - 1], end],
-                        "in_frame": int(there[i]),
-                        "detected": int(detected[i]),
-                        "rate": float(detected[i] / there[i]),
-                        "rate_ci95": [float(test.low), float(test.high)],
-                    }
-                )
-    return result
+        cars = np.array([[int(n) for n in str(row[c]).split()] for c in ("cars_in_frame", "cars_detected")])
+        counts[row["weather"]] = counts.get(row["weather"], 0) + cars
+    return [
+        {
+            "weather": weather,
+            "distance_m": [0.0 if i == 0 else DISTANCE_ENDS[i - 1], end],
+            "in_frame": int(there[i]),
+            "detected": int(detected[i]),
+            **success_columns("rate", int(detected[i]), int(there[i])),
+        }
+        for weather, (there, detected) in sorted(counts.items())
+        for i, end in enumerate(DISTANCE_ENDS)
+        if there[i]
+    ]
 
 
 def draw_survey(

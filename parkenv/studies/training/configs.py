@@ -13,8 +13,6 @@ MIN_UPDATES = 12  # a training with fewer has smaller batches
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of one algorithm."""
-
     n_envs: int  # number of parallel environments
     policy: str  # stable-baselines3's name of the policy class
     settings: Mapping[str, Any]  # arguments of the algorithm's constructor

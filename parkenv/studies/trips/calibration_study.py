@@ -121,7 +121,7 @@ class CalibrationStudy(Study):
         return [Cell(Labelled({"slots": slots}), seeds) for slots in (OBSERVED, UNOBSERVED)]
 
     def run(self, work: Labelled, items: Sequence[int]) -> list[Row]:
-        from parkenv.studies.trips.calibration import trip_row
+        from parkenv.studies.trips.driven_search import trip_row
 
         search = self.search(work.columns["slots"])
         return [work.columns | trip_row(search.run(seed)) for seed in items]
@@ -130,7 +130,7 @@ class CalibrationStudy(Study):
         return f"{self.agent.label} in {self.built.name}"
 
     def summarise(self, results: Results) -> Row:
-        from parkenv.studies.trips.calibration import calibrate
+        from parkenv.studies.trips.driven_search import calibrate
 
         rows, calibrated, table = results.all_of(self), None, list[Row]()
         try:
@@ -165,7 +165,7 @@ class CalibrationStudy(Study):
 
     def outputs(self, result: Result) -> list[Task[object]]:
         from parkenv.scenarios.calibration import Calibration
-        from parkenv.studies.trips.calibration import save_distributions
+        from parkenv.studies.trips.driven_search import save_distributions
 
         picture = result.folder / file_name(f"calibration_{self.built.name}", ".png")
         rows = result.results.all_of(self)

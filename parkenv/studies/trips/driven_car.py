@@ -50,8 +50,6 @@ class Leg(NamedTuple):
 
 
 class ParkingAttempt(NamedTuple):
-    """An attempt to park."""
-
     slot: str
     kind: str  # orientation of the slot to its lane
     way: str  # nose-in or back-in; empty for parallel slots and if no path was found
@@ -73,8 +71,6 @@ class TrackPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class DrivingStyle(Validated):
-    """Parameters of driving."""
-
     speed: Positive | None = None  # maximum on the lanes, m/s; None for the scenario's `v_drive`
     acceleration: Positive = 1.2  # acceleration, and deceleration before turns, m/s²
     braking: Positive = 2.0  # deceleration before parking, m/s²
@@ -84,8 +80,6 @@ class DrivingStyle(Validated):
 
 @dataclass
 class DriveLog:
-    """Record of a drive."""
-
     legs: list[Leg] = field(default_factory=list)  # driven edges
     attempts: list[ParkingAttempt] = field(default_factory=list)  # parking attempts
     driven_m: float = 0.0  # distance driven, forward and backward, m
@@ -242,8 +236,11 @@ class DrivenCar:
         if np.abs(self.state[:2] - self._space_at).max() > REACH_M - 10.0:
             self.refresh()
 
-    def refresh(self) -> None:
-        self.enter(self.standing(self.state[:2]))
+    def refresh(self) -> Obstacles:
+        """Build the collision world of the obstacles around the car, and return them."""
+        there = self.standing(self.state[:2])
+        self.enter(there)
+        return there
 
     def standing(self, center: FloatArray, looks_free: int | None = None) -> Obstacles:
         """Return the obstacles around a point, (2,) m, without waiting cars and any car in slot `looks_free`."""

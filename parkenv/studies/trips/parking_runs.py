@@ -50,16 +50,12 @@ class ParkingCase:
 
 
 class Parking(NamedTuple):
-    """The result of one parking episode."""
-
     row: Row  # metrics of the episode
     state: DriveState  # final state of the episode, with the driven trail
     frames: list[Any] = []  # noqa: RUF012 - never changed; rendered frames, if requested
 
 
 class _MotionRecorder(Observer):
-    """Steering angle and heading at the start and after every step."""
-
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         self.drive, self.motion = cast("DriveEnv", env.unwrapped), list[tuple[float, float]]()
         self._record()

@@ -220,8 +220,7 @@ class VehicleController:
         for _ in range(_MOST_PLANS):
             now = line.station_of(self.car.middle[:2])
             askew = max(askew, _askew(line.pose(now), self.car.pose))
-            there = self.car.standing(self.car.state[:2])
-            self.car.enter(there)
+            there = self.car.refresh()
             onward = MERGE_DISTANCES_M if askew < U_TURN_ANGLE else RETURN_DISTANCES_M
             path = self._planned_onto(self.car.pose, line, now, onward, there, TURN_MARGINS[-1:])
             if path is None:
@@ -347,8 +346,7 @@ class VehicleController:
         if self._line is not None and self._line != ways[0][0]:
             line = self._lines.lines[self._line]
             ways.append((self._line, line.station_of(self.scenario.lot.vertex_xy[slot])))
-        there = self.car.standing(self.car.state[:2])
-        self.car.enter(there)
+        there = self.car.refresh()
         self.car.path = None
         for _ in range(_MOST_PLANS):
             if any(self._is_on(self._lines.lines[index]) for index, _ in ways):
