@@ -67,11 +67,11 @@ READS = dict.fromkeys(
     ("json.load", "json.loads", "yaml.safe_load", "tomllib.load", "csv.DictReader", "gzip.open", "joblib.load",
      "np.load", "np.loadtxt", "np.genfromtxt", "cv2.imread", "cv2.imdecode", "Image.open", "pickle.load"), (),
 ) | dict.fromkeys(("yaml.load", "tomllib.loads", "csv.reader"), ("parkenv/files/limited_reading.py",)) | {
-    "torch.load": ("parkenv/studies/training/checkpoint.py",),  # weights_only
+    "torch.load": ("parkenv/studies/training/training.py",),  # weights_only
     "PillowImage.open": ("parkenv/files/images.py",),
     "tarfile.open": ("parkenv/files/limited_reading.py",),
     "zipfile.ZipFile": (
-        "parkenv/files/limited_reading.py", "parkenv/perception/car_model.py", "parkenv/studies/training/checkpoint.py",
+        "parkenv/files/limited_reading.py", "parkenv/perception/car_model.py", "parkenv/studies/training/training.py",
     ),
     "pickle.loads": ("parkenv/compiled/code_files.py",),
 }  # fmt: skip

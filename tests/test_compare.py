@@ -81,13 +81,11 @@ def test_figures_and_occupancy_levels(tmp_path):
 
 
 def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path):
-    done = ran(
+    ran(
         "compare", "--scenario", "mini", "--agents", "greedy-drive,mdp-tuned", "-n", 6, "--failure-cost", "sweep",
         "--jobs", 1, "--out", tmp_path,
     )  # fmt: skip
     assert [p.name for p in tmp_path.glob("*.png")] == ["time_against_failure_cost_mini.png"]
-    # A row of each agent, with and without observations, and a column of each cost.
-    assert len(re.findall(r"(?:greedy-drive|mdp-tuned)(?: +\d+\.\d){13} *$", done.stdout, re.M)) == 3
     rows = summary_of(tmp_path)["rows"]
     tries = {(r["scenario"], r["failure_cost_s"]): r for r in rows if r["agent"] == "greedy-drive"}
     assert len(tries) == 26
@@ -131,7 +129,7 @@ def test_worse_sight_costs_time_and_the_stacks_is_nearly_perfect(tmp_path):
     total = {}
     for sight in ("perfect", "laser", tmp_path / "poor.json"):
         out = tmp_path / f"out{len(total)}"
-        ran(*small(out, "--sensor-model", sight, agents="greedy-drive", episodes=40))
+        ran(*small(out, "--sensor-model", sight, agents="greedy-drive", episodes=25))
         total[sight] = rows_without_times(out)[0]
     perfect, laser, poor = total.values()
     assert perfect["failed_s"] == 0.0 < poor["failed_s"]
@@ -152,11 +150,9 @@ def test_plan_writes_a_path_and_a_picture(tmp_path):
 
 def test_intervals_cover_the_mean_as_often_as_they_say():
     rng = np.random.default_rng(0)
-    covered = 0
-    for _ in range(100):
-        _, low, high = mean_interval(rng.normal(5.0, 2.0, 60))
-        covered += low <= 5.0 <= high
-    assert stats.binomtest(covered, 100, 0.95).pvalue > 0.01
+    intervals = [mean_interval(rng.normal(5.0, 2.0, 60)) for _ in range(40)]
+    covered = sum(low <= 5.0 <= high for _, low, high in intervals)
+    assert stats.binomtest(covered, 40, 0.95).pvalue > 0.01
 
 
 def test_degenerate_samples_have_sane_intervals():

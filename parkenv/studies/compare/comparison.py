@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, ensure
 from parkenv.files.field_types import Probability
 from parkenv.files.known_names import UNBEATEN
 from parkenv.files.option import Option, numbers_in, option
@@ -217,7 +217,7 @@ class Comparison(CaseStudy):
         budgets, agents = self.grid.budget_ms, list[AgentSpec]()
         for agent in self.agents:
             is_timed = budgets and BUDGET not in agent.options and BUDGET in agent_options(agent.name)
-            timed = [AgentSpec(name=agent.name, **agent.options, **{BUDGET: ms}) for ms in budgets]
+            timed = [AgentSpec(name=agent.name, **{**agent.options, BUDGET: ms}) for ms in budgets]
             agents += timed if is_timed else [agent]
         return agents
 
@@ -279,17 +279,20 @@ class Comparison(CaseStudy):
 
             for name in {self.detector or scenario.detector for scenario in self._base_scenarios}:
                 make_detector(name)
-        if self.grid.blind and not any(_works_blind(agent) for agent in self.agents):
-            raise InputError(
-                "blind searches have no observations, and all agents plan on observations: "
-                f"{', '.join(agent.label for agent in self.agents)}; add one that does not, such as mdp"
-            )
-        if self.grid.budget_ms and self.budgeted_agents == list(self.agents):
-            raise InputError(
-                f"{BUDGET} is {', '.join(f'{ms:g}' for ms in self.grid.budget_ms)}, and no agent takes it: "
-                f"{', '.join(agent.label for agent in self.agents)}; add one that does, such as rollout"
-            )
-        names = [scenario.name for scenario in self.built]
+        names, labels = (
+            [scenario.name for scenario in self.built],
+            ", ".join(agent.label for agent in self.agents),
+        )
+        ensure(
+            not self.grid.blind or any(map(_works_blind, self.agents)),
+            f"blind searches have no observations, and all agents plan on observations: {labels}; add one that does "
+            "not, such as mdp",
+        )
+        ensure(
+            not self.grid.budget_ms or self.budgeted_agents != list(self.agents),
+            f"{BUDGET} is {', '.join(f'{ms:g}' for ms in self.grid.budget_ms)}, and no agent takes it: {labels}; add "
+            "one that does, such as rollout",
+        )
         if repeated := [name for name in names if names.count(name) > 1]:
             raise InputError(
                 f"two scenarios are called {repeated[0]!r}, want different names; rename one of them"
