@@ -431,5 +431,5 @@ def _seen_through(spec: ScenarioSpec, rig: str | None) -> ScenarioSpec:
     is_named = model.name not in (None, "perfect") or model.hit_rate is not None or model.file is not None
     if rig is None or is_named:
         return spec
-    name = "stereo" if rig == "stereo" else "laser"
-    return spec.changed(sensor_model=SensorModelSpec(name=name, view_range=model.view_range))
+    measured = SensorModelSpec(name="stereo" if rig == "stereo" else "laser", view_range=model.view_range)
+    return spec.changed(sensor_model=measured)

@@ -226,7 +226,9 @@ class Training:
                 f"{checkpoint}: is gone; the training cannot go on from {curve[-1]['steps']} steps"
             )
         begun = read_checkpoint(checkpoint) if checkpoint.exists() else None
-        config = SEARCH_CONFIGS[self.spec.algorithm].for_steps(self.spec.steps, begun and begun["n_envs"])
+        config = SEARCH_CONFIGS[self.spec.algorithm].for_steps(
+            self.spec.steps, begun["n_envs"] if begun else None
+        )
         env, rate = self.make_env(config.n_envs), config.settings["learning_rate"]
         model = algorithm_class(self.spec.algorithm)(
             config.policy,
