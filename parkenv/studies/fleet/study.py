@@ -34,7 +34,6 @@ from parkenv.studies.fields import (
     require_at_most,
     require_distinct_names,
 )
-from parkenv.studies.fingerprints import search_settings
 from parkenv.studies.fleet.setting import (
     BY_HOUR,
     CAR_LISTS,
@@ -49,7 +48,7 @@ from parkenv.studies.fleet.setting import (
     Setting,
     rate_text,
 )
-from parkenv.studies.results import Results, Row, Table
+from parkenv.studies.results import Results, Row, Table, search_settings
 from parkenv.studies.study import Cell, ReplayJob, ReportOptions, Study
 from parkenv.studies.workers import Task
 
