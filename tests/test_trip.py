@@ -402,7 +402,7 @@ def test_a_slot_too_narrow_for_the_car_is_left_and_not_sought_again():
     ("make", "message"),
     [
         (lambda: DrivingStyle(notice_m=0.3), "notice_m is 0.3, want a number of at least 0.8"),
-        (lambda: DrivingStyle(speed=math.nan), "speed is nan, want a number above 0"),
+        (lambda: DrivingStyle(speed=math.nan), "speed is nan, want a finite number"),
         (
             lambda: DrivenSearch(MINI, style=DrivingStyle(speed=30.0)),
             "speed on lanes is 30 m/s, want at most 8",
