@@ -19,8 +19,7 @@ from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
-from parkenv.studies.fingerprints import search_settings
-from parkenv.studies.results import Results, Row, Table
+from parkenv.studies.results import Results, Row, Table, search_settings
 from parkenv.studies.study import Cell, Stage, Study, counted
 from parkenv.world.week import HOUR_S
 
