@@ -1,7 +1,5 @@
 """Write files atomically: complete or not at all."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil
@@ -69,7 +67,6 @@ def _temporary(path: Path) -> Path:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, and check that it is writable before any work is done."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / f".probe.{os.getpid()}"

@@ -5,8 +5,6 @@ libraries read settings there. Users' classes are still found: `parkenv.files.us
 named.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """CSV tables: written whole, read with one kind of value in a column; a wrong value is named with its place."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -32,10 +30,6 @@ def _number(text: str) -> float:
     return value
 
 
-def _number_or_nan(text: str) -> float:
-    return float("nan") if text == "nan" else _number(text)
-
-
 def _whole(text: str) -> int:
     if not (text.isdecimal() and len(text) <= _MAX_DIGITS):
         raise ValueError(text)
@@ -44,7 +38,9 @@ def _whole(text: str) -> int:
 
 TEXT = Kind("text", str)
 NUMBER = Kind(f"a number, at most {MAX_NUMBER:g}", _number)
-NUMBER_OR_NAN = Kind(f"a number, at most {MAX_NUMBER:g}, or nan", _number_or_nan)
+NUMBER_OR_NAN = Kind(
+    f"a number, at most {MAX_NUMBER:g}, or nan", lambda text: float("nan") if text == "nan" else _number(text)
+)
 WHOLE = Kind(f"a whole number of at most {_MAX_DIGITS} digits", _whole)
 
 
@@ -87,8 +83,6 @@ def csv_columns(columns: Sequence[Sequence[Any]]) -> str:
 
 
 class _Lines(io.StringIO):
-    """Lines of a table, which end with a line feed alone."""
-
     def write(self, line: str) -> int:
         return super().write(line.removesuffix("\r\n") + "\n")
 

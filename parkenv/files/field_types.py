@@ -1,7 +1,5 @@
 """Types of validated fields, and the base of dataclasses whose fields are checked by their types."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from functools import cache
 from typing import Annotated, Any, TypeVar, get_type_hints

@@ -1,7 +1,5 @@
 """Names of files that are made from names of lots, scenarios and agents, and from other files."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

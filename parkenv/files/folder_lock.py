@@ -1,7 +1,5 @@
 """One writer per folder."""
 
-from __future__ import annotations
-
 import os
 import socket
 from collections.abc import Iterator
@@ -19,11 +17,7 @@ LOCK = ".lock"
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder during the block, and remove what a killed writer left half-written there.
-
-    The system releases the lock when this process ends, even by SIGKILL, so a lock cannot be stale. Worker processes do
-    not inherit it.
-    """
+    """Hold a folder's lock, which the system releases when this process ends; remove what a killed writer left."""
     path = folder / LOCK
     lock = FileLock(path)
     try:

@@ -1,7 +1,5 @@
 """Read images from files and folders, within limits."""
 
-from __future__ import annotations
-
 import io
 import re
 import struct
@@ -81,9 +79,8 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def files_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    return sorted((f for f in folder.rglob("*") if f.suffix.lower() in suffixes), key=natural_order)
-
-
-def natural_order(path: Path) -> list[tuple[str, int]]:
-    """Return a sort key that puts pos-9 before pos-10."""
-    return [(word, int(digits or -1)) for word, digits in re.findall(r"(\D*)(\d*)", str(path))]
+    files = (file for file in folder.rglob("*") if file.suffix.lower() in suffixes)
+    # pos-9 before pos-10
+    return sorted(
+        files, key=lambda file: [(w, int(d or -1)) for w, d in re.findall(r"(\D*)(\d*)", str(file))]
+    )

@@ -1,7 +1,5 @@
 """Names that files and commands know, without the modules behind them: help and completion need no more."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 PackagedLot = Literal["campus", "jam", "street", "mini", "town"]

@@ -3,8 +3,6 @@
 Every file that a user names is read through this module or `parkenv.files.images`.
 """
 
-from __future__ import annotations
-
 import bz2
 import csv
 import gzip
@@ -88,7 +86,6 @@ def require_file(path: str | Path) -> None:
 
 
 def unpacked_path(path: Path) -> Path:
-    """Return a path without the suffix of a packed file: `town.osm` of `town.osm.gz` and `town.osm.bz2`."""
     return path.with_suffix("") if path.suffix.lower() in _PACKED else path
 
 
@@ -96,8 +93,7 @@ def unpacked_path(path: Path) -> Path:
 def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]:
     """Open a file for reading at most `most` bytes; names that end in `.gz` and `.bz2` are unpacked.
 
-    What states that it has no bytes is read as empty. Files of /proc state so whatever they hold, and some of them wait
-    for news when read, such as /proc/kmsg.
+    Files that state no size, as in /proc, are empty: some of them wait for news when read.
     """
     require_file(path)
     try:
@@ -111,9 +107,9 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
             stream: Any = packed[1](stored) if packed else stored
             yield io.BufferedReader(Counted(stream, most, path), 1 << 20)
         except (EOFError, zlib.error, OSError) as error:
-            if packed and not getattr(error, "strerror", None):
-                raise InputError(f"{path}: not a whole {packed[0]} file ({error})") from error
-            raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+            reason = getattr(error, "strerror", None)
+            damaged = f"not a whole {packed[0]} file ({error})" if packed else error
+            raise InputError(f"{path}: {reason or damaged}") from error
         except UnicodeDecodeError as error:
             raise InputError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
 
@@ -229,9 +225,10 @@ def csv_rows(path: str | Path, most: int = MAX_BYTES) -> Iterator[tuple[int, lis
 
 
 def csv_records(path: str | Path, most: int = MAX_BYTES) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the rows of a CSV file below its header, by the header's names, with their line numbers."""
     rows = csv_rows(path, most)
     _, header = next(rows, (0, []))
+    if twice := [name for name in header if header.count(name) > 1]:
+        raise InputError(f"{path}: line 1: has two columns {twice[0]!r:.80}")
     for line, row in rows:
         yield line, dict(zip(header, row, strict=True))
 
@@ -256,12 +253,7 @@ def _require_shallow(content: Any, name: str, *, plain: bool = False) -> None:
             raise InputError(f"{name}: has an integer above {1 << 63}")
         elif plain and not isinstance(value, str | int | float | None):
             raise InputError(f"{name}: has a {type(value).__name__} ({value!r:.40}), want text or a number")
-        elif (
-            plain
-            and isinstance(value, str)
-            and not value.isascii()
-            and value != value.encode(errors="replace").decode()
-        ):
+        elif plain and isinstance(value, str) and value != value.encode(errors="replace").decode():
             raise InputError(f"{name}: has text that is not Unicode: {value!a:.40}")
 
 
@@ -303,12 +295,12 @@ def parse_arrays(data: bytes, name: str) -> dict[str, NDArray[Any]]:
                 (1, 0): np.lib.format.read_array_header_1_0,
                 (2, 0): np.lib.format.read_array_header_2_0,
             }[version]
-            shape, is_fortran, dtype = read_header(stream)
+            shape, _, dtype = read_header(stream)
             size = math.prod(shape) * dtype.itemsize
-            if dtype.hasobject or min(shape, default=0) < 0 or size != len(content) - stream.tell():
+            if min(shape, default=0) < 0 or size != len(content) - stream.tell():
                 raise ValueError(f"{dtype}{shape} in {len(content):,} bytes")
-            array = np.frombuffer(content, dtype, offset=stream.tell()).copy()
-            arrays[member.removesuffix(".npy")] = array.reshape(shape, order="F" if is_fortran else "C")
+            stored = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+            arrays[member.removesuffix(".npy")] = stored
         except (ValueError, LookupError, TypeError, SyntaxError, *_HEADER_ERRORS) as error:
             raise InputError(f"{name}: {member}: not an array of numbers: {error}") from error
     return arrays
@@ -316,17 +308,11 @@ def parse_arrays(data: bytes, name: str) -> dict[str, NDArray[Any]]:
 
 @dataclass(frozen=True)
 class JsonFormat:
-    """A file format.
+    """A file format; this version of the package reads and writes no other version of it."""
 
-    Args:
-        name: value of `"format"` in the file.
-        version: value of `"version"`; this version of the package reads and writes no other.
-        meaning: description of the format for messages.
-    """
-
-    name: str
+    name: str  # value of `"format"` in the file
     version: int
-    meaning: str
+    meaning: str  # for messages
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
         try:

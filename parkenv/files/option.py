@@ -1,7 +1,5 @@
 """Command-line options of the fields of specifications."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -48,13 +46,7 @@ _MARKS = {mark.name for mark in fields(Option)} - {"description"}
 
 
 def option(value: Any, description: str, **more: Any) -> Any:
-    """Return a field of a specification that is an option.
-
-    Args:
-        value: its default; `...` if there is none.
-        description: what it says.
-        more: arguments of `Option`, and of pydantic's `Field`, such as bounds.
-    """
+    """Return a field that is an option; `more` are arguments of `Option`, and of pydantic's `Field`, such as bounds."""
     marks = {name: more.pop(name) for name in _MARKS & more.keys()}
     field = Field(value, description=description, **more)
     field.metadata.append(Option(**marks))
@@ -63,15 +55,10 @@ def option(value: Any, description: str, **more: Any) -> Any:
 
 @dataclass(frozen=True)
 class Inside:
-    """Choose the fields of a table, at any depth, that are options: an annotation of the field with the table.
+    """Choose the fields of a table, at any depth, that are options: an annotation of the field with the table."""
 
-    Args:
-        without: Options to leave out.
-        only: The options to have.  [default: all]
-    """
-
-    without: tuple[str, ...] = ()
-    only: tuple[str, ...] | None = None
+    without: tuple[str, ...] = ()  # options to leave out
+    only: tuple[str, ...] | None = None  # the options to have; None: all
 
     def has(self, name: str) -> bool:
         return name not in self.without and (self.only is None or name in self.only)
@@ -104,10 +91,6 @@ def seconds_of_minutes(text: str) -> float:
 
 def parse_call(text: str, kind: str = "agent") -> dict[str, Any]:
     """Parse a name with any options in brackets, such as `mdp(failure_s=90)`: the table of its `name` and its options.
-
-    Args:
-        text: the text.
-        kind: what the name is of, for messages.
 
     Examples:
         >>> parse_call("mdp(failure_s=90,solver=policy_iteration)")

@@ -1,7 +1,5 @@
 """Read messages, and the pictures among them, from MCAP files and rosbags, by the library rosbags."""
 
-from __future__ import annotations
-
 import bz2
 import functools
 import io
@@ -41,7 +39,6 @@ IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedIm
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is named like a recording: by its suffix, or as the folder of a rosbag of ROS 2."""
     return path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file()
 
 
@@ -54,9 +51,7 @@ def require_rosbags() -> None:
 def open_recording(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
     """Open an MCAP file, a rosbag of ROS 2 (folder, .mcap or .db3) or of ROS 1 (.bag).
 
-    Yields:
-        The type of each topic, and a function that reads the messages of some topics in order: topic, time of the
-        recording in ns, message.
+    Yields the type of each topic, and a function that reads the messages of some topics in order: topic, ns, message.
     """
     require_rosbags()
     from rosbags.rosbag1 import Reader as Reader1
@@ -84,14 +79,14 @@ def open_recording(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
 
         def messages(topics: set[str]) -> Iterator[tuple[str, int, Any]]:
             chosen = [c for c in reader.connections if c.topic in topics]
-            found = reader.messages(connections=chosen) if chosen else iter(())
+            stored = reader.messages(connections=chosen) if chosen else iter(())
             while True:
                 with _in_words(path):
-                    one = next(found, None)
-                    message = None if one is None else deserialize(one[2], one[0].msgtype)
-                if one is None:
+                    connection, stamp, data = next(stored, (None, 0, b""))
+                    message = connection and deserialize(data, connection.msgtype)
+                if connection is None:
                     return
-                yield one[0].topic, one[1], message
+                yield connection.topic, stamp, message
 
         yield {c.topic: c.msgtype for c in reader.connections}, messages
     finally:
@@ -169,7 +164,6 @@ def _require_few_overlaps(path: Path, chunks: Any) -> None:
 
 
 def stamp_of(message: Any, recorded: int) -> int:
-    """Return the time of a message, ns: its header's, or that of the recording."""
     header = getattr(message, "header", None)
     return recorded if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
@@ -187,9 +181,8 @@ def _raw(message: Any, where: str) -> Image:
     data = np.frombuffer(bytes(message.data), np.uint8)
     if step < width * channels or height * step > len(data) or not height * width:
         raise InputError(f"{where}: has {len(data):,} bytes for {width}×{height} px of {message.encoding}")
-    image = (
-        data[: height * step].reshape(height, step)[:, : width * channels].reshape(height, width, channels)
-    )
+    rows = data[: height * step].reshape(height, step)
+    image = rows[:, : width * channels].reshape(height, width, channels)
     if channels == 1:
         return image[..., 0]
     return np.ascontiguousarray(image[..., ::-1] if message.encoding in ("bgr8", "8UC3") else image)
@@ -197,22 +190,14 @@ def _raw(message: Any, where: str) -> Image:
 
 @dataclass(frozen=True)
 class Footage:
-    """The pictures of one camera in a recording, as a video.
+    """The pictures of one camera in a recording, as a video."""
 
-    Attributes:
-        path: the file or folder.
-        topic: of the pictures.
-        width, height: px.
-        fps: pictures per second, on average.
-        frames: number of pictures.
-    """
-
-    path: Path
+    path: Path  # the file or folder
     topic: str
-    width: int
+    width: int  # px
     height: int
-    fps: float
-    frames: int
+    fps: float  # pictures per second, on average
+    frames: int  # number of pictures
 
     @property
     def name(self) -> str:
@@ -242,21 +227,21 @@ class Footage:
 def footage_in(path: Path) -> list[Footage]:
     with open_recording(path) as (types, _):
         topics = sorted(topic for topic, kind in types.items() if kind in (IMAGE, COMPRESSED_IMAGE))
-    found = []
+    cameras = []
     for topic in topics:
         pictures = _pictures(path, topic)
-        first = next(pictures, None)
-        if first is None:
+        start, message = next(pictures, (0, None))
+        if message is None:
             continue
-        height, width = picture_in(first[1], f"{path}: {topic}: image 1").shape[:2]
-        stamps = [first[0], *(stamp for stamp, _ in pictures)]
+        height, width = picture_in(message, f"{path}: {topic}: image 1").shape[:2]
+        stamps = [start, *(stamp for stamp, _ in pictures)]
         seconds = (stamps[-1] - stamps[0]) / 1e9
         fps = (len(stamps) - 1) / seconds if seconds > 0.0 else USUAL_FPS
-        found.append(Footage(path, topic, width, height, fps, len(stamps)))
-    if not found:
+        cameras.append(Footage(path, topic, width, height, fps, len(stamps)))
+    if not cameras:
         there = ", ".join(sorted(f"{topic} ({kind})" for topic, kind in types.items())[:12]) or "nothing"
         raise InputError(f"{path}: has no pictures, want {IMAGE} or {COMPRESSED_IMAGE}; it has {there}")
-    return found
+    return cameras
 
 
 def _pictures(path: Path, topic: str) -> Iterator[tuple[int, Any]]:

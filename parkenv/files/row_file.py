@@ -1,7 +1,5 @@
 """SQLite files of rows in JSON: opened so that a stranger's does no harm, and written in transactions."""
 
-from __future__ import annotations
-
 import json
 import os
 import sqlite3
@@ -35,19 +33,13 @@ class RowFile:
     """A file of rows, each of which has a name of its kind and a key.
 
     Args:
-        path: the file; created if it does not exist, unless `create` is False.
+        path: the file.
         what: what such a file is, for messages and in its head.
         made_by: who makes one, for messages.
         create: whether to write, and to create a missing file; False opens it for reading only.
         alone: whether no other process opens it meanwhile: each transaction is fast, and its rows survive the end of
             this process, but only those of the second before that of the machine.
         about: what the head of a new file also says.
-
-    Attributes:
-        head: what the head of the file says.
-
-    Raises:
-        InputError: the file does not exist, is another one, is too large, or cannot be written.
     """
 
     def __init__(
@@ -100,7 +92,6 @@ class RowFile:
         self.close()
 
     def close(self) -> None:
-        """Close the file; the log of a writer that was alone becomes part of it."""
         if self._alone:
             with self._errors_in_words():
                 self._db.execute("PRAGMA journal_mode = DELETE")
@@ -116,11 +107,8 @@ class RowFile:
         with self._errors_in_words():
             query = "SELECT value, crc32 FROM row WHERE name = ? ORDER BY rowid"
             for text, check in self._db.execute(query, (name,)):
-                row = (
-                    parse_json(text, f"{self.path}: a row of {name}")
-                    if crc32(text.encode()) == check
-                    else None
-                )
+                sound = crc32(text.encode()) == check
+                row = parse_json(text, f"{self.path}: a row of {name}") if sound else None
                 if not isinstance(row, dict):
                     raise InputError(f"{self.path}: a row of {name} is damaged")
                 yield row
@@ -213,20 +201,20 @@ class RowFile:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
 
     def _reason(self, error: sqlite3.DatabaseError) -> str:
-        text = str(error)
-        if "not a database" in text:
-            return f"is no {self.what} (no SQLite file at all)"
-        if "readonly" in text or "unable to open" in text:
-            return "cannot be written; want a file in a folder that you may write to"
-        if "locked" in text:
-            return f"is in use by others for more than {_PATIENCE_S:g} s"
-        if "disk I/O" in text or "is full" in text:
-            return f"cannot be written: {text}; is the disk full, or the size of files limited?"
-        return f"cannot be used as a {self.what}: {text}"
+        no_space = f"cannot be written: {error}; is the disk full, or the size of files limited?"
+        reasons = {
+            "not a database": f"is no {self.what} (no SQLite file at all)",
+            "readonly": "cannot be written; want a file in a folder that you may write to",
+            "unable to open": "cannot be written; want a file in a folder that you may write to",
+            "locked": f"is in use by others for more than {_PATIENCE_S:g} s",
+            "disk I/O": no_space,
+            "is full": no_space,
+        }
+        known = (reason for text, reason in reasons.items() if text in str(error))
+        return next(known, f"cannot be used as a {self.what}: {error}")
 
 
 def to_json(value: Any) -> str:
-    """Return a value with arrays or numbers of NumPy as JSON; NaN stays one."""
     return json.dumps(value, default=lambda array: array.tolist())
 
 

@@ -1,9 +1,8 @@
 """Specification files of scenarios and experiments: TOML or JSON, validated by pydantic, with one-line errors."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar, get_args
 
@@ -40,6 +39,8 @@ _WANTED = {
     "missing": "one more value",
     "unexpected_keyword_argument": "no such key",
     "float_type": "a number",
+    "float_parsing": "a number",
+    "int_parsing": "a whole number",
     "finite_number": "a finite number",
     "is_instance_of": "an instance of {class}",
     "int_type": "a whole number",
@@ -91,13 +92,16 @@ PackagedDetector = Annotated[str, BeforeValidator(_detector), AfterValidator(_pa
 """A packaged detector or a file."""
 
 
+@dataclass(frozen=True)
 class OrText:
-    """Annotation of a table that may also be given as text, such as a file name: the JSON schema allows both."""
+    """Annotation of a table that may also be given as text, or as a number: the JSON schema allows both."""
+
+    kind: str = "string"
 
     def __get_pydantic_json_schema__(
         self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        return {"anyOf": [{"type": "string"}, handler(core_schema)]}
+        return {"anyOf": [{"type": self.kind}, handler(core_schema)]}
 
 
 Several = Annotated[tuple[T, ...], Strict(False)]  # a list in the file, a tuple in Python
@@ -142,7 +146,6 @@ class Spec(BaseModel):
         return cls.parse(read_tables(path), str(path), path.parent).of_file(path)
 
     def of_file(self, path: str | Path) -> Self:
-        """Remember the file that the specification was read from, for messages."""
         self._file = str(path)
         return self
 
@@ -165,15 +168,13 @@ class Spec(BaseModel):
         write_text(path, json.dumps(self.tables(), indent=2) + "\n")
 
     def files(self) -> list[Path]:
-        found: list[Path] = []
+        files: dict[Path, None] = {}
         for name in type(self).model_fields:
             value = getattr(self, name)
             for part in value if isinstance(value, tuple) else (value,):
-                if isinstance(part, Path):
-                    found.append(part)
-                elif isinstance(part, Spec):
-                    found += part.files()
-        return list(dict.fromkeys(found))
+                own = [part] if isinstance(part, Path) else part.files() if isinstance(part, Spec) else ()
+                files |= dict.fromkeys(own)
+        return list(files)
 
     def tables(self) -> dict[str, Any]:
         return self.model_dump(mode="json", exclude_none=True)

@@ -1,7 +1,5 @@
 """Read the poses of a drive: a CSV table, or the track of a GPX file."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,21 +21,13 @@ _WANT = "want columns time or file, x and y (m) or lat and lon (degrees), and ya
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The poses of a drive, in order.
+    """The poses of a drive, in order."""
 
-    Attributes:
-        stamps: (n,) ns of Unix time, rising; seconds after seconds where the file has no times.
-        files: (n,) names of the pictures; empty if it has none.
-        positions: (n, 2) m in the lot, or degrees, longitude first.
-        in_degrees: which of the two.
-        yaw: (n,) rad, counter-clockwise from east; NaN where it is not given.
-    """
-
-    stamps: IntArray
-    files: tuple[str, ...]
-    positions: FloatArray
-    in_degrees: bool
-    yaw: FloatArray
+    stamps: IntArray  # (n,) ns of Unix time, rising; seconds after seconds where the file has no times
+    files: tuple[str, ...]  # (n,) names of the pictures; empty if it has none
+    positions: FloatArray  # (n, 2) m in the lot, or degrees, longitude first
+    in_degrees: bool  # which of the two
+    yaw: FloatArray  # (n,) rad, counter-clockwise from east; NaN where it is not given
 
     def headings(self, xy: FloatArray) -> FloatArray:
         """Return the headings, (n,) rad: as given, else the direction from position to position, (n, 2) m."""
@@ -59,16 +49,11 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
 
     A table has `time` or `file` (a picture's name), or both; `x` and `y` (m in the lot) or `lat` and `lon` (degrees);
     and, if they are known, `yaw` (rad, counter-clockwise from x) or `heading` (degrees, clockwise from north). Other
-    columns are skipped. A time is a date, Unix time from 1e8 s on, or, below 604,800 s, time since Monday 00:00.
-
-    Args:
-        path: the file.
-        timezone_s: time of the place minus UTC; dates without zone are of the place.
+    columns are skipped. A time is a date, of the place if it has no zone, Unix time from 1e8 s on, or, below 604,800 s,
+    time since Monday 00:00; `timezone_s` is the time of the place minus UTC.
     """
-    time = Kind(
-        "a date (2026-05-04T09:00:00Z), Unix time, or seconds of a week",
-        lambda text: stamp_in(text, timezone_s),
-    )
+    wanted = "a date (2026-05-04T09:00:00Z), Unix time, or seconds of a week"
+    time = Kind(wanted, lambda text: stamp_in(text, timezone_s))
     kinds = dict.fromkeys(("x", "y", "lat", "lon", "heading"), NUMBER) | {"time": time}
     kinds["yaw"] = Kind("radians, -6.3 to 6.3", _angle)
     if path.suffix.lower() == ".gpx":
@@ -79,8 +64,10 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
             try:
                 rows.append({name: kinds[name].parse(point.get(name, "")) for name in ("time", "lat", "lon")})
             except ValueError as error:
-                its = str(point)[:120]
-                raise InputError(f"{path}: track point {number} is {its}, want lat, lon and time") from error
+                shown = str(point)[:120]
+                raise InputError(
+                    f"{path}: track point {number} is {shown}, want lat, lon and time"
+                ) from error
     elif not path.is_file():
         raise InputError(f"{path}: no such file")
     else:
@@ -93,9 +80,9 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
         rows = [row for k, row in enumerate(rows) if k == 0 or row["time"] != rows[k - 1]["time"]]
     stamps = np.array([row.get("time", (MONDAY_S + k) * 10**9) for k, row in enumerate(rows)], np.int64)
     if (fall := np.flatnonzero(np.diff(stamps) <= 0)).size:
-        one, two = stamps[fall[0] : fall[0] + 2] / 1e9
-        at_pose = f"{one:.3f} to {two:.3f} s at pose {fall[0] + 2}"
-        raise InputError(f"{path}: time goes from {at_pose}, want it to rise")
+        before, after = stamps[fall[0] : fall[0] + 2] / 1e9
+        times = f"{before:.3f} to {after:.3f} s at pose {fall[0] + 2}"
+        raise InputError(f"{path}: time goes from {times}, want it to rise")
     at = np.array([[row[name] for name in pair] for row in rows])
     if pair[0] == "lon" and (off := np.flatnonzero((np.abs(at) > (180.0, 90.0)).any(axis=1))).size:
         place = at[off[0]].tolist()
@@ -107,19 +94,16 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
 
 def stamp_in(text: str, timezone_s: float) -> int:
     """Return a time, ns of Unix time, or raise ValueError; see `read_track`."""
+    fraction, shift = 0, 0.0
     try:
         seconds: float = NUMBER.parse(text)
-        is_of_week, fraction = 0.0 <= seconds < _WEEK_S, 0
-        shift = timezone_s - MONDAY_S if is_of_week else 0.0
+        if 0.0 <= seconds < _WEEK_S:
+            return round((seconds - (timezone_s - MONDAY_S)) * 1e9)
     except ValueError:
         date = datetime.fromisoformat(text)
-        is_of_week, fraction, shift = (
-            False,
-            date.microsecond * 1000,
-            timezone_s if date.tzinfo is None else 0.0,
-        )
+        fraction, shift = date.microsecond * 1000, timezone_s if date.tzinfo is None else 0.0
         seconds = date.replace(microsecond=0, tzinfo=date.tzinfo or UTC).timestamp()
-    if not is_of_week and not _UNIX_S[0] <= seconds <= _UNIX_S[1]:
+    if not _UNIX_S[0] <= seconds <= _UNIX_S[1]:
         raise ValueError(text)
     return round((seconds - shift) * 1e9) + fraction
 

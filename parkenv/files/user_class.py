@@ -1,7 +1,5 @@
 """User-defined classes, named `MODULE:CLASS` on a command line or in a file."""
 
-from __future__ import annotations
-
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
@@ -14,13 +12,9 @@ from parkenv.errors import InputError
 
 
 def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> Any:
-    """Import the class `MODULE:CLASS`; the module may be in the working directory.
+    """Import the class `MODULE:CLASS`, which has a method, such as `detect(image)`, perhaps from the working directory.
 
-    Args:
-        name: name, such as `my_detectors:Mine`.
-        kind: role of the class, for messages: `agent`, `detector`.
-        method: required method of the class, with its parameters: `detect(image)`.
-        alternatives: other valid values for the part before the colon, for the message.
+    For messages, `kind` is its role, such as a detector, and `alternatives` are other values for the module.
     """
     module, _, class_name = name.partition(":")
     if not all(part.isidentifier() for part in (*module.split("."), class_name)):
@@ -30,7 +24,7 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
     if here not in sys.path:
         sys.path.append(here)
     try:
-        found = getattr(import_module(module), class_name)
+        named = getattr(import_module(module), class_name)
     except ModuleNotFoundError as error:
         if error.name != module.partition(".")[0]:
             raise InputError(
@@ -49,16 +43,15 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
         raise InputError(
             f"{kind} {name!r}: its module fails: {type(error).__name__}: {error}{where}"
         ) from error
-    if not isinstance(found, type) or not callable(getattr(found, method.partition("(")[0], None)):
+    if not isinstance(named, type) or not callable(getattr(named, method.partition("(")[0], None)):
         raise InputError(f"{kind} {name!r}: has no method {method}")
-    return found
+    return named
 
 
 def failure_of(error: Exception, names: Iterable[str]) -> InputError | None:
     """Return what to tell of an error in one of the classes, `MODULE:CLASS`; None if none had to do with it."""
-    files = {
-        str(file_of_class(name)): name for name in names if name.partition(":")[0] in sys.modules
-    }  # in this process
+    in_process = (name for name in names if name.partition(":")[0] in sys.modules)
+    files = {str(file_of_class(name)): name for name in in_process}
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if name := files.get(frame.filename):
             return InputError(
@@ -70,13 +63,12 @@ def failure_of(error: Exception, names: Iterable[str]) -> InputError | None:
 def find_module(name: str) -> str | None:
     """Return where the module of `MODULE:CLASS` would be imported from, without importing it; None if nowhere."""
     folders: Sequence[str] = [*sys.path, str(Path.cwd())]
-    found = None
+    origin = None
     for part in name.partition(":")[0].split("."):
-        found = PathFinder.find_spec(part, folders)
-        if found is None:
+        if (spec := PathFinder.find_spec(part, folders)) is None:
             return None
-        folders = found.submodule_search_locations or ()
-    return None if found is None else found.origin
+        folders, origin = spec.submodule_search_locations or (), spec.origin
+    return origin
 
 
 def file_of_class(name: str) -> Path | None:

@@ -27,8 +27,6 @@ _MOST_FPS = 1_000.0
 
 
 class VideoFrame(NamedTuple):
-    """One frame of a video."""
-
     number: int  # from 0
     time: float  # s since the first frame's time 0, never earlier than the frame before
     image: Image  # (h, w, 3) uint8, RGB
@@ -36,20 +34,13 @@ class VideoFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Video:
-    """A video file.
-
-    Attributes:
-        path: the file.
-        width, height: px.
-        fps: frames per second, 25 where the file does not say.
-        frames: number of frames as the file says; None where it does not.
-    """
+    """A video file."""
 
     path: Path
-    width: int
+    width: int  # px
     height: int
-    fps: float
-    frames: int | None
+    fps: float  # frames per second, 25 where the file does not say
+    frames: int | None  # number of frames as the file says; None where it does not
 
     @property
     def name(self) -> str:
@@ -57,7 +48,6 @@ class Video:
 
     @property
     def file(self) -> Path:
-        """The file, after which films of it are named."""
         return self.path
 
     @classmethod
@@ -126,7 +116,7 @@ def _opened(path: Path) -> Iterator[Any]:
         width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if width * height > MAX_PIXELS:
             raise InputError(
-                f"{path}: has frames of {width:.0f}×{height:.0f} px, want at most {MAX_PIXELS:,}"
+                f"{path}: has frames of {width:.0f}×{height:.0f} px, want {MAX_PIXELS:,} at most"
             )
         yield capture
     finally:
