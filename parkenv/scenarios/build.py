@@ -16,13 +16,13 @@ from parkenv.errors import InputError, naming, nearest, require_keywords
 from parkenv.files.option import parse_call
 from parkenv.files.user_class import load_class
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
-from parkenv.scenarios.purposes import demand_of
 from parkenv.scenarios.spec import (
     SAME_SLOTS,
     CountsSpec,
     ForecastSpec,
     LotSpec,
     OccupancySpec,
+    PurposeSpec,
     ScenarioSpec,
     SensorModelSpec,
     TypicalWeek,
@@ -41,13 +41,15 @@ from parkenv.world.occupancy.typical_week import (
 )
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
-from parkenv.world.tariff import Tariff, Zone
+from parkenv.world.tariff import PUBLIC, Tariff, Zone
 from parkenv.world.traffic import Traffic
 from parkenv.world.week import DAY_S
 
 if TYPE_CHECKING:
     from parkenv.forecast.counts import Counts
     from parkenv.forecast.day_forecast import DayForecast
+    from parkenv.world.demand import TownDemand
+    from parkenv.world.occupancy.arrival_window import ArrivalWindow
     from parkenv.world.occupancy.counted import CountedOccupancy
     from parkenv.world.occupancy.log import OccupancyLog
 
@@ -132,7 +134,6 @@ def require_changes(owners: Sequence[type], changes: Iterable[str], *others: str
 
 
 def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec]:
-    """Return the `count` scenarios whose lots have the most slots, the largest first; equal ones in their order."""
     slots = [_lot(spec.lot).n_slots for spec in specs]
     order = sorted(range(len(specs)), key=lambda i: -slots[i])
     return [specs[i] for i in order[:count]]
@@ -293,7 +294,6 @@ def _counted(spec: CountsSpec, first: date, past: bool, lot: ParkingLot, goal: i
 
 
 def _changed(file: Path) -> int:
-    """Return when a file was changed: another key of a cache."""
     return file.stat().st_mtime_ns if file.exists() else 0
 
 
@@ -371,3 +371,51 @@ def sensor_model(spec: SensorModelSpec) -> SensorModel:
     else:
         model = SensorModel() if spec.file is None else SensorModel.from_file(spec.file)
     return dataclasses.replace(model, **rates)
+
+
+def demand_of(
+    purposes: Mapping[str, PurposeSpec], lot: ParkingLot, window: ArrivalWindow
+) -> TownDemand | None:
+    """Return the demand of a scenario's tables, by weights of the lot, or equal ones if another table has some."""
+    from parkenv.world.demand import ConstantTime, Demand, TownDemand, weights_of_all
+
+    if not purposes:
+        return None
+    if window.end_s <= window.start_s:
+        raise InputError("arrivals.hours are one time, want hours in which the cars of `demand` arrive")
+    ends = {"goals": (lot.goals, lot.goal_weights), "entries": (lot.entries, lot.entry_weights)}
+    defaults: dict[str, tuple[float, ...]] = {}
+    for field, (points, of_lot) in ends.items():
+        some = any(getattr(spec, field) for spec in purposes.values())
+        defaults[field] = weights_of_all(of_lot) or ((1.0,) * len(points) if some else ())
+    users = {zone.name: zone.users for zone in lot.zone_rules.values()}
+    spaces = [
+        (users.get(zone, (PUBLIC,)), int(lot.capacity[lot.zone_of_slot == k].sum()))
+        for k, zone in enumerate(lot.zones)
+    ]
+    demands = []
+    for name, spec in purposes.items():
+        table = f"demand.{name}"
+        for user in (user for user in spec.classes if user not in lot.classes[1:]):
+            raise InputError(
+                f"{table}.classes has {user!r:.40}, no class of lot {lot.name!r:.40} beside {PUBLIC}; "
+                f"{nearest(user, lot.classes[1:])}"
+            )
+        room = sum(n for may, n in spaces if PUBLIC in may or set(may) & set(spec.classes))
+        if spec.parked > room:
+            raise InputError(
+                f"{table}.parked is {spec.parked}, want at most the {room:,} spaces that it may use"
+            )
+        weights: dict[str, tuple[float, ...]] = {}
+        for field, (points, of_lot) in ends.items():
+            weights[field] = own = getattr(spec, field) or tuple(of_lot.get(name, defaults[field]))
+            if own and len(own) != len(points):
+                raise InputError(
+                    f"{table}.{field} has {len(own)} numbers, the lot has {len(points)} of these"
+                )
+        rest = spec.model_dump(include={"value_of_time", "classes", "walks_back", "kwh", "parked"})
+        laws = spec.arrivals(window), spec.stay, ConstantTime(spec.patience_s)
+        with naming(table):
+            demands.append(Demand(*laws, weights["entries"], weights["goals"], name=name, **rest))
+    with naming("demand"):
+        return TownDemand(tuple(demands))

@@ -1,7 +1,5 @@
 """Values measured by `parkenv calibrate`, which may replace the assumed ones of a scenario."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which of several scenarios an episode is in, which are kept from training, and scenarios without observations."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Sequence
@@ -87,5 +85,4 @@ def require_different_names(scenarios: Sequence[Scenario]) -> None:
 
 
 def blind_scenario(scenario: Scenario) -> Scenario:
-    """Return a renamed scenario in which slots are not observed before a parking attempt."""
     return scenario.replace(name=f"{scenario.name}{BLIND}", sensor_model=SensorModel.blind())

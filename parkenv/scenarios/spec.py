@@ -7,30 +7,29 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import date, datetime
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
     BeforeValidator,
     ConfigDict,
     Field,
-    GetJsonSchemaHandler,
     ValidationInfo,
     WithJsonSchema,
     model_validator,
 )
-from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.field_types import Probability
 from parkenv.files.known_names import (
     DETECTORS,
     LOT_SUFFIXES,
+    MAX_CARS,
     PACKAGED_LOTS,
     SCENARIO_NAMES,
     SENSOR_MODELS,
@@ -51,13 +50,16 @@ from parkenv.files.spec_file import (
     resolved_path,
 )
 from parkenv.files.user_class import find_module
-from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
 from parkenv.world.tariff import NO_ZONE, VALUE_OF_TIME, Price, Zone, parse_change
 from parkenv.world.tariff import Hours as ZoneHours
-from parkenv.world.week import HOUR_S
+from parkenv.world.week import DAY_HOURS, HOUR_S
+
+if TYPE_CHECKING:  # help and completion read fields alone
+    from parkenv.world.demand import Arrivals as ArrivalLaw
+    from parkenv.world.demand import Duration
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]  # km/h
 Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]  # s, at most a day
@@ -96,18 +98,16 @@ class CityLot(Spec):
     seed: int = Field(0, ge=0, lt=2**32)
 
 
-def _lot_tables(value: object) -> object:
-    if isinstance(value, Path):
-        return {"file": value}
-    if not isinstance(value, str):
-        return value
-    if value in PACKAGED_LOTS:
-        return {"name": value}
-    if not value.endswith(LOT_SUFFIXES):
+def _from_text(table_of: Callable[[str], dict[str, Any]]) -> BeforeValidator:
+    return BeforeValidator(lambda value: table_of(str(value)) if isinstance(value, str | Path) else value)
+
+
+def _lot_table(text: str) -> dict[str, Any]:
+    if not text.endswith(LOT_SUFFIXES) and text not in PACKAGED_LOTS:
         raise ValueError(
             f"a packaged lot ({', '.join(PACKAGED_LOTS)}) or a lot file ({', '.join(LOT_SUFFIXES)})"
         )
-    return {"file": value}
+    return {"name" if text in PACKAGED_LOTS else "file": text}
 
 
 class LotSpec(Spec):
@@ -173,21 +173,14 @@ class Event(Spec):
     factor: float = Field(gt=0, le=1e6, description="Factor of their arrival rates.")
 
 
-def _occupancy_tables(value: object) -> object:
-    if isinstance(value, Path):
-        value = str(value)
-    if not isinstance(value, str):
-        return value
-    if value == "typical":
-        return {"typical": {}}
-    if value == "real-week":
-        return {"real_week": {}}
-    if value.endswith(".json"):
-        return {"process": value}
-    if value.endswith((".csv", ".csv.gz")):
-        return {"log": value}
-    if ":" in value:
-        return {"world": value}
+def _occupancy_table(text: str) -> dict[str, Any]:
+    if text in ("typical", "real-week"):
+        return {text.replace("-", "_"): {}}
+    for kind, endings in (("process", ".json"), ("log", (".csv", ".csv.gz"))):
+        if text.endswith(endings):
+            return {kind: text}
+    if ":" in text:
+        return {"world": text}
     raise ValueError(
         "typical, real-week, a process (.json), a recorded log (.csv, .csv.gz), MODULE:CLASS, or a table"
     )
@@ -219,15 +212,6 @@ def _day_error_tables(value: object) -> object:
 
 def _day_error_text(text: str) -> object:
     return dict(zip(("level", "slope"), numbers_in(text, min(text.count(",") + 1, 2)), strict=False))
-
-
-class OrNumber:
-    """Annotation of a table that may also be given as a number: the JSON schema allows both."""
-
-    def __get_pydantic_json_schema__(
-        self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> JsonSchemaValue:
-        return {"anyOf": [{"type": "number"}, handler(core_schema)]}
 
 
 class CountsSpec(_Popularity):
@@ -290,7 +274,7 @@ class OccupancySpec(Spec):
         default="the log's fullest slots are nearest to the goal",
     )
     event: Event | None = None
-    day_error: Annotated[DayError, BeforeValidator(_day_error_tables), OrNumber()] | None = option(
+    day_error: Annotated[DayError, BeforeValidator(_day_error_tables), OrText("number")] | None = option(
         None,
         "Difference of whole days from the forecast: standard deviations, logits, of their level "
         "and of their slope to the goal; 0: days are as forecast.",
@@ -303,27 +287,36 @@ class OccupancySpec(Spec):
     @model_validator(mode="after")
     def _one(self) -> Self:
         _require_one(self, ("typical", "real_week", "process", "log", "counts", "world"), least=0)
-        if self.world is not None and not (self.day_error is None and self.event is None):
-            raise ValueError("day_error and event cannot be combined with a world, which has its own days")
-        recorded = self.log is not None or self.counts is not None
-        if self.day_error is not None and recorded:
-            raise ValueError(
-                "day_error cannot be combined with a log or counts, whose days differ by themselves"
-            )
-        if self.car_parks and (self.log is None or self.replay_from is None):
-            raise ValueError("car_parks only together with a file of counts as the log, and replay_from")
-        if self.mapping is not None and self.log is None:
-            raise ValueError("mapping only together with a log")
-        if self.replay_from is not None and not recorded:
-            raise ValueError("replay_from only together with a log or counts")
-        if self.counts is not None and self.replay_from is None:
-            raise ValueError("replay_from together with counts: the days before it are for the forecast")
-        if self.counts is not None and self.forecast_from == "others":
-            raise ValueError("forecast_from rolling or past together with counts")
-        if self.forecast_from not in (None, "others") and self.replay_from is None:
-            raise ValueError("forecast_from only together with replay_from")
-        if self.event is not None and recorded:
-            raise ValueError("event cannot be combined with a log or counts, whose days have their events")
+        recorded, own_days = bool(self.log or self.counts), self.day_error is not None
+        dated = self.replay_from is not None
+        for fault, wanted in (
+            (
+                self.world and (own_days or self.event),
+                "day_error and event only without a world, which has days",
+            ),
+            (
+                own_days and recorded,
+                "day_error only without a log or counts, whose days differ by themselves",
+            ),
+            (
+                self.car_parks and not (self.log and dated),
+                "car_parks only with counts as the log, and replay_from",
+            ),
+            (self.mapping is not None and not self.log, "mapping only together with a log"),
+            (dated and not recorded, "replay_from only together with a log or counts"),
+            (
+                self.counts and not dated,
+                "replay_from together with counts: the forecast needs days before it",
+            ),
+            (
+                self.counts and self.forecast_from == "others",
+                "forecast_from rolling or past together with counts",
+            ),
+            (self.forecast_from not in (None, "others") and not dated, "forecast_from only with replay_from"),
+            (self.event and recorded, "event only without a log or counts, whose days have their events"),
+        ):
+            if fault:
+                raise ValueError(wanted)
         return self
 
     def files(self) -> list[Path]:
@@ -331,18 +324,11 @@ class OccupancySpec(Spec):
         return [*super().files(), *([Path(module)] if module else [])]
 
 
-def _forecast_tables(value: object) -> object:
-    if isinstance(value, Path):
-        value = str(value)
-    if not isinstance(value, str):
-        return value
-    if value == "own":
-        return {}
-    if value.endswith(".json"):
-        return {"process": value}
-    if value.endswith(".sqlite"):
-        return {"map": value}
-    raise ValueError("own, a process (.json), a map file (.sqlite), or a table")
+def _forecast_table(text: str) -> dict[str, Any]:
+    kind = {".json": "process", ".sqlite": "map"}.get(Path(text).suffix)
+    if kind is None and text != "own":
+        raise ValueError("own, a process (.json), a map file (.sqlite), or a table")
+    return {kind: text} if kind else {}
 
 
 class ForecastSpec(Spec):
@@ -444,7 +430,6 @@ _Amount = Annotated[float | str, BeforeValidator(_amount), WithJsonSchema(_PRICE
 
 
 def _prices(value: object) -> object:
-    """Make a table of what several options give."""
     if not isinstance(value, tuple):
         return value
     zones = [zone for zone, _ in value]
@@ -496,16 +481,10 @@ class Costs(Spec):
     )
 
 
-def _sensor_tables(value: object) -> object:
-    if isinstance(value, Path):
-        return {"file": value}
-    if not isinstance(value, str):
-        return value
-    if value in SENSOR_MODELS:
-        return {"name": value}
-    if not value.endswith(".json"):
+def _sensor_table(text: str) -> dict[str, Any]:
+    if not text.endswith(".json") and text not in SENSOR_MODELS:
         raise ValueError(f"{', '.join(SENSOR_MODELS)} or a file (.json)")
-    return {"file": value}
+    return {"name" if text in SENSOR_MODELS else "file": text}
 
 
 class SensorModelSpec(Spec):
@@ -547,10 +526,9 @@ class TrafficSpec(Spec):
 def _goal(value: object) -> object:
     if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
         return value
-    if isinstance(value, list | tuple) and len(value) == 2:
-        x, y = value
-        if all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= 1e7 for v in (x, y)):
-            return float(x), float(y)
+    point = value if isinstance(value, list | tuple) else ()
+    if len(point) == 2 and all(type(v) in (int, float) and abs(v) <= 1e7 for v in point):
+        return tuple(map(float, point))
     raise ValueError("the index of one of the lot's goals, or a point [x, y] in m")
 
 
@@ -562,6 +540,79 @@ def _name(value: str) -> str:
     if len(value) > 80 or not value.isprintable() or set(value) & set("/\\,"):
         raise ValueError("at most 80 printable characters without comma or slash")
     return value
+
+
+MAX_RATE = 1e6  # maximum number of cars an hour
+Rate = Annotated[float, Field(ge=0.0, le=MAX_RATE)]
+Rates = Annotated[
+    Several[Rate],
+    Field(min_length=DAY_HOURS, max_length=DAY_HOURS),
+    BeforeValidator(lambda value: [value] * DAY_HOURS if isinstance(value, int | float) else value),
+    OrText("number"),
+]
+"""Of each hour of the day; a number is that of all."""
+Weights = Several[Annotated[float, Field(ge=0.0, le=1e12)]]
+
+
+def _purpose(value: str) -> str:
+    if not 0 < len(value) <= 80 or not value.isprintable():
+        raise ValueError("a name of 1 to 80 printable characters")
+    return value
+
+
+PurposeName = Annotated[str, AfterValidator(_purpose)]
+
+
+class PurposeSpec(Spec):
+    """Drivers with one purpose: when they arrive, how long they stay, where they go, and what they may and mind."""
+
+    arrivals_per_hour: Rates = Field(
+        description="Cars an hour, one number or 24, one for each hour of the day."
+    )
+    stay_s: float = Field(3600.0, ge=1.0, le=1e7, description="Mean stay.")
+    stay_law: Literal["exponential", "log-normal", "constant"] = "exponential"
+    stay_cv: float = Field(1.0, gt=0.0, le=10.0, description="Coefficient of variation of log-normal stays.")
+    value_of_time: float | None = Field(
+        None,
+        gt=0.0,
+        le=1e6,
+        description="Value of an hour of the drivers' time, in the currency of the prices; that of `costs` if "
+        "absent.",
+    )
+    classes: dict[str, Annotated[float, Field(ge=0.0, le=1.0)]] = Field(
+        {}, description="Share of the drivers of each class, for example permit-a, disabled or charging."
+    )
+    walks_back: bool = Field(False, description="Whether the walk back to the car counts, too.")
+    patience_s: float = Field(
+        600.0,
+        gt=0.0,
+        le=1e7,
+        description="Search time, without the drive to the goal, after which cars go elsewhere.",
+    )
+    kwh: float = Field(0.0, ge=0.0, le=1e3, description="Energy that a car of the class charging takes, kWh.")
+    parked: int = Field(0, ge=0, le=MAX_CARS, description="Cars that are parked when the hours begin.")
+    goals: Weights = Field(
+        (), description="Weight of each goal of the lot; those of the lot for this purpose if absent."
+    )
+    entries: Weights = Field(
+        (), description="Weight of each entry of the lot; those of the lot for this purpose if absent."
+    )
+
+    @property
+    def stay(self) -> Duration:
+        from parkenv.world.demand import ConstantTime, ExponentialTime, LogNormalTime
+
+        if self.stay_law == "log-normal":
+            return LogNormalTime(self.stay_s, self.stay_cv)
+        return (ConstantTime if self.stay_law == "constant" else ExponentialTime)(self.stay_s)
+
+    def arrivals(self, window: ArrivalWindow) -> ArrivalLaw:
+        from parkenv.world.demand import NoArrivals, PoissonArrivals
+
+        start, end = int(window.start_s // 3600), math.ceil(window.end_s / 3600)
+        if not any(self.arrivals_per_hour[start:end]):
+            return NoArrivals(window.start_s)
+        return PoissonArrivals(self.arrivals_per_hour, window.start_s, window.end_s)
 
 
 class ZoneSpec(Spec):
@@ -611,7 +662,7 @@ class ScenarioSpec(Spec):
     name: Annotated[str, AfterValidator(_name)] = Field(
         "", description="Name in tables; the file's name by default."
     )
-    lot: Annotated[LotSpec, BeforeValidator(_lot_tables), OrText()]
+    lot: Annotated[LotSpec, _from_text(_lot_table), OrText()]
     goal: Annotated[int | tuple[float, float], BeforeValidator(_goal)] = option(
         0,
         "Walk to this point, m, or to the lot's goal of this index.",
@@ -621,7 +672,7 @@ class ScenarioSpec(Spec):
         default="the scenario's",
     )
     entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
-    occupancy: Annotated[OccupancySpec, BeforeValidator(_occupancy_tables), OrText()] = option(
+    occupancy: Annotated[OccupancySpec, _from_text(_occupancy_table), OrText()] = option(
         OccupancySpec(),
         "States of the slots: recorded logs (.csv, .csv.gz) of the same slots, replayed day by "
         "day; a process of `parkenv occupancy fit` (.json); or your own world, MODULE:CLASS.",
@@ -630,7 +681,7 @@ class ScenarioSpec(Spec):
         default="the scenario's",
         sets={"forecast": "own"},
     )
-    forecast: Annotated[ForecastSpec, BeforeValidator(_forecast_tables), OrText()] = ForecastSpec()
+    forecast: Annotated[ForecastSpec, _from_text(_forecast_table), OrText()] = ForecastSpec()
     arrivals: Arrivals = Arrivals()
     demand: dict[PurposeName, PurposeSpec] = Field(
         {}, description="Demand of many cars by purpose, in the hours of `arrivals`."
@@ -638,7 +689,7 @@ class ScenarioSpec(Spec):
     zones: dict[str, ZoneSpec] = Field({}, description="Rules of zones in place of the lot's, by name.")
     speeds: Speeds = Speeds()
     costs: Costs = Costs()
-    sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = option(
+    sensor_model: Annotated[SensorModelSpec, _from_text(_sensor_table), OrText()] = option(
         SensorModelSpec(name="perfect"),
         "How slots are observed. perfect: without error; blind: only by attempts; laser, stereo: "
         "fitted to that rig; a file of `parkenv fit-sensor-model`.",
@@ -683,7 +734,6 @@ class ScenarioSpec(Spec):
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a scenario file; the default name of the scenario is that of the file."""
         path = Path(path)
         spec = cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent).of_file(path)
         if spec.occupancy.world is not None:
@@ -704,7 +754,6 @@ class ScenarioSpec(Spec):
 
     @property
     def source(self) -> str:
-        """The file that the scenario was read from, or its name, for messages."""
         return self._file or f"scenario {self.title!r}"
 
     @property
@@ -755,11 +804,7 @@ def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
 
 
 def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
-    """Return the scenario of a packaged lot or a lot file alone: first goal, any entry, week of busy real car parks.
-
-    Week and days are derived from counts of real car parks, see `parkenv.world.occupancy.real_week_figures`: on
-    workdays fuller than nine in ten of them, 55 % at 8:00 and 82 % at 11:00, more near the goal.
-    """
+    """Return the scenario of a lot alone: first goal, any entry, and a week fuller than nine in ten real car parks."""
     name = "".join(c if c.isprintable() and c not in "/\\," else " " for c in Path(lot).stem)[:80]
     tables = {"name": name, "lot": str(lot), "occupancy": {"real_week": {}, "day_error": DAY_ERROR}}
     return ScenarioSpec.parse(tables, str(lot) if source is None else source).of_file(lot)

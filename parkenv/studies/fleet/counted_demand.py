@@ -12,9 +12,8 @@ from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.forecast.comparison import last_week
 from parkenv.forecast.counts import Counts
-from parkenv.scenarios.build import build
-from parkenv.scenarios.purposes import PurposeSpec, demand_of
-from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.scenarios.build import build, demand_of
+from parkenv.scenarios.spec import PurposeSpec, ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import compiled_policy_of
 from parkenv.studies.results import Row, without_nan

@@ -13,8 +13,7 @@ from pydantic import Field
 from parkenv.errors import InputError
 from parkenv.files.option import option
 from parkenv.files.spec_file import FilePath
-from parkenv.scenarios.purposes import PurposeSpec
-from parkenv.scenarios.spec import Date, scenario_spec
+from parkenv.scenarios.spec import Date, PurposeSpec, scenario_spec
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
