@@ -133,25 +133,21 @@ def test_days_held_out_are_predicted_from_the_counts_before_them(town, tmp_path)
 
     def counts(name, change):
         path = write_counts(tmp_path / name, first=date(2024, 1, 1), days=30, change=change)
-        lines = path.read_text().splitlines()
-        path.write_text(
-            "\n".join(names.get(row.split(",")[0], "car_park") + row[row.index(",") :] for row in lines)
-        )
+        lines = [line.partition(",") for line in path.read_text().splitlines()]
+        path.write_text("\n".join(f"{names.get(park, park)},{rest}" for park, _, rest in lines))
         return path
 
     rows, summary, folder = predicted(town, counts("a.csv", lambda park, day, taken: taken))
     other, *_ = predicted(town, counts("b.csv", lambda park, day, taken: 0.5 * taken if day >= 24 else taken))
     assert len({day for _, day, _ in rows}) == 14  # two weeks held out, of all kinds of days
-    for park, day, hour in rows:
-        same = rows[park, day, hour]["simulated"] == other[park, day, hour]["simulated"]
-        assert same or day > "2024-01-25"
-        assert (rows[park, day, hour]["counted"] == other[park, day, hour]["counted"]) or day >= "2024-01-25"
+    for key, row in rows.items():
+        assert row["simulated"] == other[key]["simulated"] or key[1] > "2024-01-25"
+        assert row["counted"] == other[key]["counted"] or key[1] >= "2024-01-25"
     assert any(rows[key]["simulated"] != other[key]["simulated"] for key in rows if key[1] == "2024-01-26")
     for row in summary["rows"]:
         lines = [line for (park, *_), line in rows.items() if park == row["car_park"]]
-        simulated, counted = (
-            np.array([float(line[name]) for line in lines]) for name in ("simulated", "counted")
-        )
+        pairs = [(float(line["simulated"]), float(line["counted"])) for line in lines]
+        simulated, counted = np.array(pairs).T
         assert row["simulated_error"] == pytest.approx(np.mean(abs(simulated - counted)), abs=1e-3)
         assert row["counted"] == pytest.approx(np.mean(counted), abs=1e-3)
     # Days differ by half a logit from their forecasts, and the town by little more.

@@ -67,14 +67,14 @@ def test_a_garage_refuses_as_erlang_says(known):
 def test_cars_stand_in_line_before_the_barrier():
     scenario = garage_alone(gate_s=20.0, inside_s=(30.0, 80.0))
     fleet = run(scenario, Demand(ListedArrivals((0.0, 1.0, 2.0, 3.0)), ConstantTime(7200.0)))
-    cars, alone_s = fleet.cars, fleet.cars["ended_at"][0] - fleet.cars["arrival"][0]
+    cars = fleet.cars
     inside_s = 30.0 + 50.0 * np.arange(4) / 5
     # Each passes 20 s after the one before it, and drives on inside as far as that is full.
     np.testing.assert_allclose(np.diff(cars["ended_at"] - inside_s), 20.0)
     np.testing.assert_allclose(cars["queued_s"], 19.0 * np.arange(4))
     np.testing.assert_allclose(cars["drive_s"], cars["ended_at"] - cars["arrival"])
     np.testing.assert_allclose(cars["total_s"], cars["drive_s"] + cars["walk_s"])
-    assert alone_s == pytest.approx(50.0 + 0.0, abs=15.0)
+    assert cars["ended_at"][0] - cars["arrival"][0] == pytest.approx(50.0, abs=15.0)
     assert scenario.enter_s.tolist() == [20.0 + 55.0]
     fleet.run(until=cars["ended_at"][0] + 7200.0)
     assert fleet.counts().tolist() == [3]
@@ -90,7 +90,7 @@ def test_every_car_is_somewhere(gate_s):
     fleet = Fleet(make_scenario(lot), demand, background="none", drivers=[GREEDY], leave_full_lot=False)
     fleet.reset(seed=2)
     full = 0
-    for minute in range(1, 480):
+    for minute in range(4, 480, 4):
         fleet.run(until=fleet.begin + 60.0 * minute)
         totals, counts = fleet.totals, fleet.counts()
         assert sum(totals[name] for name in ("due", "searching", "parked", "gone")) == len(fleet.cars)
@@ -98,7 +98,7 @@ def test_every_car_is_somewhere(gate_s):
         assert (counts <= lot.capacity).all()
         assert (fleet.taken() == (counts == lot.capacity)).all()
         full += counts[-2] == 6
-    assert 0 < full < 479
+    assert 0 < full < 119
     assert fleet.cars["failed_parks"].sum() > 0
     assert (np.sort(fleet.cars["state"]) > SEARCHING).all()
 
@@ -148,6 +148,12 @@ def test_nobody_parks_where_the_driver_may_not(agent):
         assert not result.info["parked"] or scenario.lot.slot_zone[env.unwrapped.state.vertex] != "permit"
 
 
+def parks_at(env, slot):
+    while (vertex := env.unwrapped.state.vertex) != slot:
+        env.step(way_to(env.unwrapped.scenario.lot, vertex, slot))
+    return env.step(PARK)
+
+
 def test_forbidden_slots_are_as_good_as_taken():
     scenario = make_scenario(town(zone_rules=FORBIDDEN))
     env = gym.make("parkenv/Search-v2", scenario=scenario)
@@ -158,12 +164,8 @@ def test_forbidden_slots_are_as_good_as_taken():
     assert scenario.action_masks[:10, PARK].tolist() == (~forbidden[:10]).tolist()
     assert np.isinf(scenario.arrival_cost_s[forbidden]).all()
     # An attempt there is no attempt: the car waits.
-    while env.unwrapped.state.vertex != 0:
-        env.step(way_to(scenario.lot, env.unwrapped.state.vertex, 0))
-    _, reward, terminated, _, info = env.step(PARK)
-    assert not terminated
-    assert reward == -scenario.wait_s
-    assert info["failed_parks"] == 0
+    _, reward, terminated, _, info = parks_at(env, 0)
+    assert (terminated, reward, info["failed_parks"]) == (False, -scenario.wait_s, 0)
     allowed = gym.make("parkenv/Search-v2", scenario=scenario.replace(classes=("permit-a",)))
     assert (allowed.reset(seed=0)[0]["p_occupied"] < 1.0).all()
 
@@ -174,9 +176,7 @@ def test_a_single_search_takes_as_long_inside_as_agents_expect():
     scenario = scenario.replace(walk_back=True, occupancy=typical_occupancy(scenario.lot, demand=-40.0))
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     env.reset(seed=1)
-    while (vertex := env.unwrapped.state.vertex) != 0:
-        env.step(way_to(scenario.lot, vertex, 0))
-    _, reward, terminated, _, info = env.step(PARK)
+    _, reward, terminated, _, info = parks_at(env, 0)
     assert terminated
     assert info["parked"]
     assert -reward == pytest.approx(scenario.arrival_cost_s[0])

@@ -46,14 +46,14 @@ def test_a_short_record_is_no_trouble(tmp_path, days, options):
 
 
 def test_a_fit_states_day_errors_drift_and_faults(tmp_path):
-    counts = write(tmp_path / "counts.csv", 60, fault=True)
+    counts = write(tmp_path / "counts.csv", 40, fault=True)
     assert not ran("occupancy", "fit", counts, "--out", tmp_path / "out").stderr
     summary = summary_of(tmp_path / "out")
     rows = {row["car_park"]: row for row in summary["rows"]}
     assert {name: row["negative"] for name, row in rows.items()} == {"P0": 0, "P1": 24, "empty": 0}
     assert all(rows[name]["day_error"] == pytest.approx(0.5, abs=0.15) for name in ("P0", "P1"))
     assert 0 < summary["level_drift_per_week"] < 1
-    assert summary["typical_week"] is None, "60 days are too few"
+    assert summary["typical_week"] is None, "40 days are too few"
 
 
 @pytest.mark.parametrize(

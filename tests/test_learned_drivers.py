@@ -40,13 +40,11 @@ def test_a_compiled_network_drives_as_its_model_does(algorithm, tmp_path):
     drawn = policy.data_for([MINI]).record["sampled"]
     assert drawn == (algorithm is not DQN), "policies draw their actions in fleets"
     policy = network_policy(model.policy, 5)
-    found = []
+    runs = []
     for kind, agents in ((DriverKind(policy=policy), None), (DriverKind(), [agent])):
-        fleet = driven(
-            Fleet(MINI, DEMAND, drivers=[kind], max_steps=60, leave_full_lot=False), 3, agents=agents
-        )
-        found.append(np.array([fleet.cars["total_s"], fleet.cars["n_steps"], fleet.cars["slot"]]))
-    np.testing.assert_array_equal(*found)
+        fleet = Fleet(MINI, DEMAND, drivers=[kind], max_steps=60, leave_full_lot=False)
+        runs.append(driven(fleet, 3, agents=agents).cars[["total_s", "n_steps", "slot"]].copy())
+    np.testing.assert_array_equal(*runs)
 
 
 def test_drawn_actions_have_the_probabilities_of_the_policy():
@@ -54,11 +52,7 @@ def test_drawn_actions_have_the_probabilities_of_the_policy():
     policy = pickle.loads(pickle.dumps(network_policy(model.policy, 5, sampled=True)))
     demand = Demand(PoissonArrivals(600.0, 8 * 3600, 9 * 3600))
     fleet = Fleet(MINI, demand, drivers=[DriverKind(policy=policy)], max_steps=1, background="none")
-    actual = []
-    for day in range(6):
-        fleet.reset(0, day)
-        fleet.run()
-        actual += [entry for entry, slot in zip(fleet.cars["vertex"], fleet.cars["slot"], strict=True)]
+    actual = np.concatenate([driven(fleet, 0, day).cars["vertex"].copy() for day in range(6)])
     twin = Fleet(MINI, demand, drivers=[DriverKind()], max_steps=1, background="none")
     twin.reset(0)
     car = twin.next_decision()
@@ -67,11 +61,10 @@ def test_drawn_actions_have_the_probabilities_of_the_policy():
     wanted = model.policy.get_distribution(batched, action_masks=observation["action_mask"]).distribution
     probabilities = wanted.probs.detach().numpy()[0]
     allowed = np.flatnonzero(observation["action_mask"])
-    to = {
-        int(MINI.lot.neighbors[int(twin.cars["entry"][car]), a]): probabilities[a] for a in allowed if a < 4
-    }
-    for vertex, p in to.items():
-        assert np.mean(np.array(actual) == vertex) == pytest.approx(p, abs=0.03)
+    neighbors = MINI.lot.neighbors[int(twin.cars["entry"][car])]
+    for action in allowed[allowed < 4]:
+        reached = np.mean(actual == neighbors[action])
+        assert reached == pytest.approx(probabilities[action], abs=0.03)
 
 
 def test_layers_that_do_not_fit_are_named():

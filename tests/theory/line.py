@@ -10,7 +10,7 @@ from closed_forms import Statement, closed_form
 from expected_time import observation
 
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.lots.generators import KERB_SIZE, ONE_WAY_HALF_WIDTH, Slots, kerb_rows
+from parkenv.lots.generators import KERB_SIZE, ONE_WAY_HALF_WIDTH, kerb_rows
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.world.lot import PARK, Lane, ParkingLot
 from parkenv.world.occupancy.process import OccupancyProcess
@@ -31,18 +31,10 @@ BEYOND_ASKED = 10  # slots beyond the goal for which agents are asked whether th
 
 @dataclass(frozen=True)
 class Line:
-    """A one-way lane of slots through the goal.
-
-    Args:
-        q: probability that a slot is taken.
-        ratio: v_walk/v_drive.
-        before, beyond: number of slots before and beyond the one at the goal.
-    """
-
-    q: float
-    ratio: float
-    before: int
-    beyond: int
+    q: float  # probability that a slot is taken
+    ratio: float  # v_walk/v_drive
+    before: int  # number of slots before the one at the goal
+    beyond: int  # and beyond it
 
     @classmethod
     def long(cls, q, ratio):
@@ -88,18 +80,15 @@ class Line:
     def problem(self, slots=slice(None), rest_s=0.0):
         kerb_y = -ONE_WAY_HALF_WIDTH
         west, east = (self.before + 0.5) * -PITCH, (self.beyond + 0.5) * PITCH
-        kerb = np.array([[west, kerb_y]]), np.array([[east, kerb_y]])
-        row = kerb_rows(*kerb, np.array([False]))[0]
+        row = kerb_rows(np.array([[west, kerb_y]]), np.array([[east, kerb_y]]), np.array([False]))[0]
         numbers = np.arange(self.n_slots)[slots]
-        cost_s = np.zeros(len(numbers))
+        cost_s, chosen = np.zeros(len(numbers)), row[numbers]
         cost_s[-1] = rest_s
-        chosen = row[numbers]
-        columns = Slots(chosen.xy, chosen.yaw, chosen.length, chosen.width, chosen.mouth, cost_s).columns()
         entry = np.array([[chosen.xy[0, 0] - PITCH, 0.0]])
         lot = ParkingLot(
             name="line",
             slot_ids=tuple(str(self.before - i) for i in numbers),
-            **columns,
+            **chosen.columns() | {"slot_parking_cost_s": cost_s},
             lanes=(Lane(np.array([entry[0], [east + PITCH, 0.0]]), oneway=True),),
             entries=entry,
             goals=np.array([[0.0, row.xy[0, 1]]]),

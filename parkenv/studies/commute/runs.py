@@ -20,6 +20,7 @@ from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap
+from parkenv.mapping.store import MapStore
 from parkenv.mapping.trips import Trip
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner, TripRecorder
@@ -132,8 +133,9 @@ def calendar(scenario: Scenario, days: int) -> list[Day]:
     return [Day(i + 1, 7 * (i // len(weekdays)) + weekdays[i % len(weekdays)], "") for i in range(days)]
 
 
-def map_file(folder: Path, run: CommuteRun) -> Path:
-    return folder / MAPS_FOLDER / file_name("_".join(str(value) for value in run.columns.values()), ".sqlite")
+def open_map(folder: Path, run: CommuteRun) -> MapStore:
+    name = file_name("_".join(map(str, run.columns.values())), ".sqlite")
+    return MapStore(folder / MAPS_FOLDER / name, run.scenario.lot)
 
 
 @dataclass(frozen=True, eq=False)

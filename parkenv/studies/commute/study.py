@@ -173,8 +173,7 @@ class Commute(Study):
         return f"{work.agent.label} in {work.scenario.name}"
 
     def stages(self, results: Results) -> Iterator[Stage]:
-        from parkenv.mapping.store import MapStore
-        from parkenv.studies.commute.runs import map_file
+        from parkenv.studies.commute.runs import open_map
 
         # A block of days needs the maps of the days before.
         for first in range(0, self.days, self.block):
@@ -182,7 +181,7 @@ class Commute(Study):
             cells = []
             for run, days in self.cells():
                 if run.learns:
-                    with MapStore(map_file(results.path, run), run.scenario.lot) as store:
+                    with open_map(results.path, run) as store:
                         run = replace(run, before=store.trips())
                 cells.append(Cell(run, days[first : first + self.block]))
             yield Stage(doing, self, cells)
@@ -191,12 +190,11 @@ class Commute(Study):
         return work.run(items)
 
     def save_artifacts(self, work: CommuteRun, rows: Sequence[Row], results: Results) -> None:
-        from parkenv.mapping.store import MapStore
-        from parkenv.studies.commute.runs import TRIP, map_file
+        from parkenv.studies.commute.runs import TRIP, open_map
 
         trips = [trip for row in rows if (trip := row.pop(TRIP)) is not None]
         if trips:
-            with MapStore(map_file(results.path, work), work.scenario.lot) as store:
+            with open_map(results.path, work) as store:
                 for trip in sorted(trips, key=lambda trip: (trip.time, trip.key)):
                     if not store.has_trip(trip.key):
                         store.add_trip(trip)
