@@ -212,7 +212,6 @@ def lot_columns(lot: ParkingLot, drivability: Drivability) -> Row:
     counts = {kind: int(number) for kind, number in zip(KINDS, numbers, strict=True)}
     low_x, low_y, high_x, high_y = lot.bounds()
     reach = dijkstra(lot.drive_matrix(), indices=lot.entry_vertices)[:, : lot.n_slots]
-    longest_m = float(reach[np.isfinite(reach)].max(initial=0.0))
     return {
         "slots": lot.n_slots,
         "size": next(name for name, below in SIZES if lot.n_slots < below),
@@ -224,7 +223,7 @@ def lot_columns(lot: ParkingLot, drivability: Drivability) -> Row:
         "one_way_lanes": sum(lane.oneway for lane in lot.lanes),
         "entries": len(lot.entries),
         "goals": len(lot.goals),
-        "drive_s": round(longest_m / V_DRIVE, 1),
+        "drive_s": round(float(reach[np.isfinite(reach)].max(initial=0.0)) / V_DRIVE, 1),
         "error_probability": round(drivability.error_probability, 3),
         "result": "warnings" if drivability.problems else "clean",
         "reason": "; ".join(problem.message for problem in drivability.problems),

@@ -75,8 +75,7 @@ def _bound_s(day: ParkingDay) -> float:
     )
     target_s = float(_schedule_in_order(day))
     # A later parking would cost more than going elsewhere
-    latest_s = np.minimum(day.patience_s, day.give_up_s)
-    n_bins = math.floor(float((day.arrival + latest_s).max()) / BIN_S) + 1
+    n_bins = math.floor(float((day.arrival + np.minimum(day.patience_s, day.give_up_s)).max()) / BIN_S) + 1
     # Rents end with the last bin
     day = day._replace(stay_s=np.minimum(day.stay_s, n_bins * BIN_S))
     alone_s = day.drive_s + day.cost_s

@@ -166,8 +166,7 @@ class CountedTown:
         stays_h = {name: (row["purpose"]["stay_s"] / HOUR_S,) for name, row in fit.items()}
         purposes = self.purposes(before, np.maximum(expected + aim - followed, 0.0), stays_h)
         if known:
-            days = range(day * episodes, (day + 1) * episodes)
-            simulated[known] = self.driven(purposes, seed, days)[known]
+            simulated[known] = self.driven(purposes, seed, range(day * episodes, (day + 1) * episodes))[known]
         only = np.array([day])
         cars = {
             "counted": self.cars(self.counts.occupied, only)[1][0],

@@ -53,8 +53,7 @@ class Roads:
     @cached_property
     def lane_of_edge(self) -> IntArray:
         lot = self._problem.lot
-        ends = lot.vertex_xy[lot.neighbors]
-        middle = (lot.vertex_xy[:, None] + ends).reshape(-1, 2) / 2
+        middle = (lot.vertex_xy[:, None] + lot.vertex_xy[lot.neighbors]).reshape(-1, 2) / 2
         tree = shapely.STRtree(linestrings([lane.points for lane in lot.lanes]))
         edge, lane = tree.query_nearest(shapely.points(middle), all_matches=False)
         lanes = np.zeros(len(middle), np.int64)
@@ -80,8 +79,7 @@ class Roads:
 
     def reach(self) -> dict[str, int]:
         capacity, can = self._problem.lot.capacity, np.isfinite(self._drive_s)
-        cut_off = int((can @ capacity < 0.5 * capacity.sum()).sum())
-        return {"entries": len(can), "entries_cut_off": cut_off}
+        return {"entries": len(can), "entries_cut_off": int((can @ capacity < 0.5 * capacity.sum()).sum())}
 
     def clairvoyant_s(self, fleet: Fleet) -> float:
         """Return the clairvoyant bound of the day of a fleet that has been reset, s, for all cars together.
@@ -101,7 +99,6 @@ class Roads:
 
     def parking_day(self, fleet: Fleet) -> ParkingDay:
         cars = fleet.cars
-        leaves_at = np.where(fleet.taken(), fleet.slots["leaves_at"], -np.inf)
         arrival, stay_s, patience_s = (
             np.array(cars[name], np.float64) for name in ("arrival", "stay_s", "patience_s")
         )
@@ -112,7 +109,7 @@ class Roads:
             entry=np.searchsorted(self._entries, cars["entry"]).astype(np.int64),
             drive_s=self._drive_s,
             cost_s=np.asarray(self._cost_s, np.float64),
-            free_from=leaves_at.astype(np.float64),
+            free_from=np.where(fleet.taken(), fleet.slots["leaves_at"], -np.inf).astype(np.float64),
             zone=np.array(self._problem.lot.zone_of_slot),
             zone_cost_s=fleet.drawn.zone_costs(),
             give_up_s=float(self._problem.give_up_s),
@@ -231,8 +228,7 @@ def gini(values: FloatArray) -> float:
     n, total = len(values), float(values.sum())
     if n == 0 or total == 0.0:
         return 0.0
-    ranks = np.arange(1, n + 1)
-    return float(2.0 * (ranks * np.sort(values)).sum() / (n * total) - (n + 1.0) / n)
+    return float(2.0 * (np.arange(1, n + 1) * np.sort(values)).sum() / (n * total) - (n + 1.0) / n)
 
 
 def day_measures(day: Day, counted: FloatArray) -> Row:

@@ -93,16 +93,14 @@ def _place(lot: ParkingLot, slots: IntArray) -> dict[str, Any]:
     # A counted facility is a square as large as its slots would be on a few storeys.
     facility = lot.facilities[lot.facility_of_slot[slots[0]]] if lot.facility_of_slot[slots[0]] >= 0 else None
     if facility is not None and facility.xy is not None and facility.is_counted:
-        side = max(math.sqrt(COUNTED_AREA * facility.capacity), LEAST_SIDE)
-        square = np.array(facility.xy) + side * SQUARE
+        square = np.array(facility.xy) + max(math.sqrt(COUNTED_AREA * facility.capacity), LEAST_SIDE) * SQUARE
         return {"at": rounded(np.array(facility.xy), 1), "areas": [[rounded(square, 1)]]}
     corners = shapely.polygons(lot.slot_corners()[slots])
     joined = shapely.union_all(shapely.buffer(corners, GAP / 2, join_style="mitre"))
     area = shapely.simplify(shapely.buffer(joined, 0.2 - GAP / 2, join_style="mitre"), 0.2)
     xy = lot.slot_xy[slots]
-    middle = xy[np.argmin(np.hypot(*(xy - xy.mean(axis=0)).T))]
     return {
-        "at": rounded(middle, 1),
+        "at": rounded(xy[np.argmin(np.hypot(*(xy - xy.mean(axis=0)).T))], 1),
         "areas": [
             [rounded(shapely.get_coordinates(ring)[:-1], 1) for ring in (part.exterior, *part.interiors)]
             for part in shapely.get_parts(area)

@@ -162,8 +162,7 @@ class DemandStudy(Study):
         yield Stage(fits.doing, fits, fits.cells())
         counts = self.town.counts
         done = counted(results.progress, "Forecasting", FIT_STEPS)
-        first_held_out = counts.day_index(self._first + timedelta(weeks=self.weeks))
-        settings = fit_settings(counts, first_held_out, done)
+        settings = fit_settings(counts, counts.day_index(self._first + timedelta(weeks=self.weeks)), done)
         forecast = forecast_days(counts, 0, "rolling", settings).occupancy
         cells = []
         for work, dates in self.cells():

@@ -399,7 +399,6 @@ class FleetStudy(FleetSpec):
         }
         zones = [row for scenario, row in blocks if has_zones(scenario)]
         in_towns = [row for scenario, row in blocks if scenario.lot.is_town]
-        mixed = [row for _, row in blocks if {*row["purpose"]} != {ALL}]
         return {
             "manoeuvre_s": self.blocked_s,
             **{name: getattr(self, name) for name in OPTIONS},
@@ -408,7 +407,7 @@ class FleetStudy(FleetSpec):
             "hours": summarize_hours(days, int(first)),
             "zones": summarize_blocks(zones, "zone", prices),
             "blocks": summarize_blocks(in_towns, "block", prices),
-            "purposes": summarize_blocks(mixed, "purpose"),
+            "purposes": summarize_blocks([row for _, row in blocks if {*row["purpose"]} != {ALL}], "purpose"),
             "reach": [{"scenario": name, **roads.reach()} for name, roads in self.roads.items()],
             "cautions": self.cautions(),
         }

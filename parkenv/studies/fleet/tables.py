@@ -90,9 +90,8 @@ class Blocks(NamedTuple):
         names = [
             f"{name} ({kind})" if count[name] > 1 else name for name, kind in zip(names, types, strict=True)
         ]
-        zones = tuple(lot.zones[zone] for zone in pairs[:, 1])
         slots = np.bincount(of_slot, lot.capacity).astype(np.int64)
-        return cls(tuple(names), tuple(types), zones, slots, of_slot)
+        return cls(tuple(names), tuple(types), tuple(lot.zones[zone] for zone in pairs[:, 1]), slots, of_slot)
 
 
 def day_rows(day: Day) -> dict[str, Row]:
@@ -255,8 +254,8 @@ def _grid(row: Row, by: str) -> tuple[list[str], IntArray, dict[str, FloatArray]
     # A zone of one block is as full as the block, to the last bit.
     share = lines["slots"] / grid["slots"][at]
     grid["occupancy"] = _sums(shape, at, np.nan_to_num(lines["occupancy"]) * share)
-    looked_at = np.unique(every["hour"][np.isfinite(every["occupancy"])])
-    grid["occupancy"][:, ~np.isin(hours, looked_at)] = np.nan
+    sampled = np.unique(every["hour"][np.isfinite(every["occupancy"])])
+    grid["occupancy"][:, ~np.isin(hours, sampled)] = np.nan
     return names.tolist(), hours, grid
 
 
