@@ -23,17 +23,9 @@ WAIT = 5  # the action of waiting where the car is
 class ChangingSolution:
     """The optimal search from every belief state; the sensor must not err.
 
-    Args:
-        problem: lot, goal, speeds and costs.
-        p_occupied: (n_slots,) constant probability that each slot is taken.
-        rate: (n_slots,) 1/s, arrival rate plus departure rate.
-        step_s: s, step of the time grid; times of moves and waits are rounded to at least one step.
-        memory_steps: number of ages that are distinguished.
-
-    Attributes:
-        values: (n_vertices, n_codes) float64, s, the least expected time; inf for states that cannot occur.
-        belief_error: bound on the error of P(free) for slots whose age is no longer distinguished.
-        rounding_error: largest relative error of the time of a move.
+    `values` are the least expected times, (n_vertices, n_codes) s, inf for states that cannot occur; `rate` is 1/s,
+    arrivals plus departures; moves and waits take at least one step; `belief_error` bounds the error of P(free) for
+    slots whose age is no longer distinguished, and `rounding_error` is the largest relative one of the time of a move.
     """
 
     def __init__(self, problem, p_occupied, rate, step_s, memory_steps):

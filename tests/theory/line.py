@@ -110,10 +110,7 @@ class Line:
 
 
 def free_slots_taken(agent, problem, p_occupied, asked):
-    """Return which of the first `asked` slots an agent takes if they are free, given that all before were taken.
-
-    The agent drives along the line past taken slots; beside each one it is also asked what it would do were it free.
-    """
+    """Drive past taken slots; beside each of the first `asked` ones, ask what the agent would do were it free."""
     lot, belief = problem.lot, SlotBelief.of_forecast(p_occupied, np.zeros(problem.lot.n_slots))
     vertex, memory = int(lot.entry_vertices[0]), None
     takes = np.zeros(asked, np.bool_)
