@@ -112,7 +112,7 @@ class _KeptFunction(CPUDispatcher):  # type: ignore[misc]
         if types in self.overloads:
             return self.overloads[types].entry_point
         alone = self._cache.alone(types) if isinstance(self._cache, CodeFiles) else nullcontext()
-        with global_compiler_lock, counted(), alone, _uncollected():
+        with global_compiler_lock, counted(), alone, _uncollected(), _late_machine_code():
             return super().compile(types)
 
 
@@ -216,16 +216,19 @@ def _before_callers() -> bool:
     return flags is None or bool(flags.fastmath) or flags.nrt
 
 
-def _make_code_late() -> None:
+@contextmanager
+def _late_machine_code() -> Iterator[None]:
+    """Let numba make `_Library`s, of what it compiles or loads for us; the user's own functions are numba's."""
     codegen = cpu_target.target_context.codegen()
-    set_now = codegen.set_env
+    library_class, set_env = codegen._library_class, codegen.set_env
 
-    def set_env(name: str, environment: Any) -> None:
+    def set_existing_env(name: str, environment: Any) -> None:
         # What a function without machine code needs from Python is set when it has some.
         if codegen._engine.is_symbol_defined(name):
-            set_now(name, environment)
+            set_env(name, environment)
 
-    codegen._library_class, codegen.set_env = _Library, set_env
-
-
-_make_code_late()
+    codegen._library_class, codegen.set_env = _Library, set_existing_env
+    try:
+        yield
+    finally:
+        codegen._library_class, codegen.set_env = library_class, set_env

@@ -183,6 +183,30 @@ def _callable_from_c(function: Any) -> Any:
     return compiled(**options | {"no_cfunc_wrapper": False})(function.py_func)
 
 
+def part_of(dtype: Any) -> Any:
+    """Return a function for compiled code: record -> the part of it that has the fields of a type, at their distances.
+
+    Functions that take the part are compiled once for all records that have it.
+    """
+    part = numba.from_dtype(np.dtype(dtype))
+    names = [name for name, _ in part.members]
+
+    @intrinsic
+    def view(_: Any, record: Any) -> Any:
+        begin = record.offset(names[0]) - part.offset(names[0])
+        layout = [(name, record.typeof(name), record.offset(name) - begin) for name in names]
+        if layout != [(name, part.typeof(name), part.offset(name)) for name in names]:
+            raise TypeError(f"the fields {names} of {record} lie otherwise than in {part}")
+
+        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            start = cgutils.pointer_add(builder, values[0], begin)
+            return builder.bitcast(start, context.get_value_type(signature.return_type))
+
+        return part(record), code
+
+    return view
+
+
 def record_at(dtype: Any) -> Any:
     """Return a function for compiled code: (address, index) -> record `index` of the array of records there."""
     dtype = np.dtype(dtype)

@@ -106,16 +106,31 @@ _DAY_BYTES = worlds.RECORDED_DAY.itemsize
 
 @kernel
 def begin_search_at(address: int) -> None:
+    """Begin the next episode; then call `init_full_prior_at` for an external prior, `observe_live_at` for live counts.
+
+    These are separate functions so that only what is in use is compiled.
+    """
     search = search_at(address, 0)
     arrive(search)
     write_clock(search)
-    if scenario_at(search.scenario, 0).prior_kind != EXTERNAL_KIND:
-        init_prior(search)
+    if search.belief != 0 and scenario_at(search.scenario, 0).prior_kind != EXTERNAL_KIND:
+        init_full_prior(search)
 
 
 @kernel
-def init_external_forecast_at(address: int) -> None:
-    init_prior(search_at(address, 0))
+def init_full_prior_at(address: int) -> None:
+    """Initialise the belief with the forecast in `Searches.external_forecast`."""
+    search = search_at(address, 0)
+    if search.belief != 0:
+        init_full_prior(search)
+
+
+@kernel
+def observe_live_at(address: int) -> None:
+    """Observe the live counts at the arrival."""
+    search = search_at(address, 0)
+    observe_live(search)
+    refresh_belief(search)
 
 
 # One function for each kind of sensor, so that only the kind in use is compiled.
@@ -191,7 +206,7 @@ def set_taken_at(address: int, slot: int) -> None:
         n -= 1
     n = search.n_step_observed if n < 0 else n
     if n < search.most_observed:
-        write_observed(search, n, slot, 1.0, 1.0, 0.0)
+        write_observed(search, n, float(slot), 1.0, 1.0, 0.0)
         search.n_step_observed = max(search.n_step_observed, n + 1)
 
 
@@ -292,7 +307,7 @@ def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float
     _, hour, second = hour_of_week(arrival)
     search.key, search.day, search.hour, search.second_of_hour = key, day, hour, second
     search.arrival, search.time, search.second_of_day = arrival, arrival, arrival - midnight
-    worlds.begin_day(scenario.world_kind, scenario.world, search)
+    worlds.begin_day(scenario.world_kind, scenario.world, worlds.world_of(search))
     search.vertex = search.previous_vertex = vertex
     search.parked = search.over = False
     for term in range(N_TERMS):

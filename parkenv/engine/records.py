@@ -189,11 +189,11 @@ SENTINEL = 0  # column shared by all slots without their own: they were not obse
 
 SLOT = np.dtype(
     [
-        ("slot", np.int32),
-        *CURSOR_FIELDS,
         ("observed", np.bool_),
         ("observed_taken", np.bool_),  # when last observed
         ("passed", np.bool_),
+        ("slot", np.int32),
+        *CURSOR_FIELDS,
     ],
     align=True,
 )

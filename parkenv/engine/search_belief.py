@@ -77,7 +77,8 @@ def observe_attempt(search: Any, column: int, taken: bool) -> None:
 @inlined
 def add_observed(search: Any, slot: int, taken: bool, hit_rate: float, false_alarm_rate: float) -> None:
     if search.step_observed != 0:
-        write_observed(search, search.n_step_observed, slot, taken, hit_rate, false_alarm_rate)
+        p_taken = 1.0 if taken else 0.0
+        write_observed(search, search.n_step_observed, float(slot), p_taken, hit_rate, false_alarm_rate)
         search.n_step_observed += 1
 
 
@@ -213,7 +214,8 @@ def find_state(search: Any, record: Any, time: float) -> None:
         # Another car may change it at any time, so `valid_until` stays 0.
         record.occupied = not is_slot_open(search.world, slot, search.car, time)
     else:
-        worlds.find_state(scenario.world_kind, search.world, search, slot, record, time)
+        world, cursor = worlds.world_of(search), worlds.cursor_of(record)
+        worlds.find_state(scenario.world_kind, search.world, world, slot, cursor, time)
 
 
 @kernel
@@ -309,14 +311,15 @@ def leaves_soon(world: Any, slot: int, time: float, soon_s: float) -> bool:
 @inlined
 def _background_state(world: Any, slot: int, shared: Any, time: float) -> bool:
     if time >= shared.valid_until:
-        worlds.find_state(world.world_kind, world.world, world, slot, shared, time)
+        cursor = worlds.cursor_of(shared)
+        worlds.find_state(world.world_kind, world.world, worlds.world_of(world), slot, cursor, time)
     return bool(shared.occupied)
 
 
 @kernel
 def empty_shared_slots(address: int) -> None:
     world = shared_world_at(address, 0)
-    worlds.begin_day(world.world_kind, world.world, world)
+    worlds.begin_day(world.world_kind, world.world, worlds.world_of(world))
     for slot in range(world.n_slots):
         shared = shared_slot_at(world.slots, slot)
         shared.sojourn, shared.valid_until = 0, -np.inf
@@ -328,8 +331,9 @@ def empty_shared_slots(address: int) -> None:
         elif world.background == RESIDENTS_BACKGROUND and _background_state(
             world, slot, shared, world.arrival
         ):
+            day, cursor = worlds.world_of(world), worlds.cursor_of(shared)
             shared.leaves_at = worlds.find_end_of_stay(
-                world.world_kind, world.world, world, slot, shared, world.arrival
+                world.world_kind, world.world, day, slot, cursor, world.arrival
             )
 
 

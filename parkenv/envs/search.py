@@ -15,7 +15,8 @@ from parkenv.compiled.jit import entry_point
 from parkenv.compiled.keyed_random import seed_state
 from parkenv.engine.kernel import (
     begin_search_at,
-    init_external_forecast_at,
+    init_full_prior_at,
+    observe_live_at,
     read_step,
     step_exact_at,
     step_noisy_at,
@@ -303,8 +304,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         begin_search_at(self._address)
         if self.searches.needs_python:
             self.searches.complete_arrival(0)
-            init_external_forecast_at(self._address)
+            init_full_prior_at(self._address)
         self._enter_scenario()
+        if self.scenario.live_slots.size:
+            observe_live_at(self._address)
         self._step = self._stepper()
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]

@@ -23,7 +23,16 @@ from parkenv.compiled.keyed_random import (
     keyed_exponential,
     keyed_uniform,
 )
-from parkenv.compiled.memory import ADDRESS, call_world_at, float64s, int64s, prefetch, record_at, uint8s
+from parkenv.compiled.memory import (
+    ADDRESS,
+    call_world_at,
+    float64s,
+    int64s,
+    part_of,
+    prefetch,
+    record_at,
+    uint8s,
+)
 from parkenv.world.occupancy.centred_logits import TABLE_ROWS, TABLE_STEPS
 from parkenv.world.occupancy.decay import decay_factor
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, HOUR_S, PERIOD_S, WEEK_HOURS, WEEK_S
@@ -73,7 +82,7 @@ WORLD_FIELDS = [
     ("day_slope", np.float64),  # logits
 ]
 WORLD = np.dtype(WORLD_FIELDS, align=True)
-"""The world of an episode in a process. Other records with these fields can be used as well."""
+"""The world of an episode in a process."""
 
 RECORDED_DAY = np.dtype(
     [
@@ -94,18 +103,19 @@ FUNCTIONS = np.dtype([("data", np.int64), ("state", ADDRESS), ("next_free", ADDR
 """
 
 CURSOR_FIELDS = [
-    ("sojourn", np.int32),  # number of the sojourn, from 1; 0 before the first query
-    ("since", np.float64),  # its begin, s
+    ("since", np.float64),  # begin of the sojourn, s
     ("valid_until", np.float64),  # s, the state lasts at least until then
+    ("sojourn", np.int32),  # its number, from 1; 0 before the first query
     ("occupied", np.bool_),
     ("end_known", np.bool_),  # whether it ends exactly then
 ]
 CURSOR = np.dtype(CURSOR_FIELDS, align=True)
-"""The computed part of one slot's true state. Other records with these fields can be used as well."""
+"""The computed part of one slot's true state."""
 
 process_at, world_at = record_at(PROCESS), record_at(WORLD)
 recorded_day_at, cursor_at = record_at(RECORDED_DAY), record_at(CURSOR)
 functions_at = record_at(FUNCTIONS)
+world_of, cursor_of = part_of(WORLD), part_of(CURSOR)  # of records with their fields
 
 
 @compiled(error_model="numpy")
