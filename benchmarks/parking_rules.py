@@ -5,7 +5,7 @@
 The folder holds the parking of Berlin-Neukölln (ODbL) as GeoJSON: `parking_way` (kerbs with capacities),
 `streets_processed_epsg25833` (street lines) and `parking_area`; extracts of OpenStreetMap add car parks with
 capacities. Kerbs are fitted on one half of the streets, by name, and judged on the other. Rules of areas are fitted
-with each tenth of the car parks left out once, and judged there. The figures go into `parkenv.lots.town.kerbs` and
+with each tenth of the car parks left out once, and judged there. The figures go into `parkenv.lots.town.supply` and
 `capacity`.
 """
 
@@ -24,12 +24,10 @@ from pyproj import Transformer
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.areas import areas_of, is_parking_area
 from parkenv.lots.osm.elements import read_map
+from parkenv.lots.osm.parking import Junctions, areas_of, free_intervals, is_parking_area
 from parkenv.lots.osm.roads import Road, road_of, whole_number
-from parkenv.lots.osm.rows import Junctions, free_intervals
-from parkenv.lots.town.kerbs import PLACES_PER_METRE
-from parkenv.lots.town.supply import KINDS, RULES, levels_of, rule_of
+from parkenv.lots.town.supply import KINDS, PLACES_PER_METRE, RULES, levels_of, rule_of
 from parkenv.world.drive_graph import linestrings
 
 COUNTED = ("OSM", "document", "aerial imagery", "survey")

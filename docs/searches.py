@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.lots import import_town, packaged_lot, write_lot
+from parkenv.lots import packaged_lot, write_lot
+from parkenv.lots.town.draft import import_town
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.agent_spec import AgentSpec

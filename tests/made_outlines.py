@@ -1,7 +1,6 @@
 """Made car parks as outlines of parking spaces, in the form in which overpass-turbo exports them."""
 
 import json
-import sys
 
 import numpy as np
 
@@ -81,30 +80,3 @@ def feature(number, tags, shape, coordinates):
 def write(path, made):
     path.write_text(json.dumps(made), encoding="utf-8")
     return path
-
-
-def town():
-    """A fictional town with five car parks: a shop's, a curved one, an oblique one, a street, and a small one."""
-    oblique = [
-        row((0.0, 4.5), 0.0, 12, angle_deg=60.0),
-        row((35.0, 0.0), 180.0, 12, angle_deg=120.0),
-        row((35.0, 13.9), 180.0, 14),
-        row((0.0, 19.9), 0.0, 14),
-    ]
-    curved = [row((0.0, 0.0), 0.0, 26, bend=1.5), row((0.4, -6.0), 0.0, 26, bend=1.5)[:, ::-1] - [0.0, 5.0]]
-    parts = [
-        (double_row(16), (0.0, 0.0), 12.0),
-        (curved, (140.0, 10.0), -8.0),
-        (oblique, (30.0, 130.0), 40.0),
-        ([kerb((0.0, 0.0), 0.0, 9), kerb((60.0, -5.5), 180.0, 10)], (170.0, 120.0), 70.0),
-        ([row((0.0, 0.0), 0.0, 11)], (-110.0, 60.0), -30.0),
-    ]
-    placed = []
-    for rows, moved, turned_deg in parts:
-        cos, sin = np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))
-        placed += [spaces @ np.array([[cos, sin], [-sin, cos]]) + moved for spaces in rows]
-    return document(placed)
-
-
-if __name__ == "__main__":
-    sys.stdout.write(",\n{".join(json.dumps(town()).split(", {")) + "\n")

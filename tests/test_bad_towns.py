@@ -13,8 +13,8 @@ from made_maps import STREET
 from test_import_town import grid
 
 from parkenv import InputError, make_scenario
-from parkenv.lots import import_town
 from parkenv.lots.osm import elements
+from parkenv.lots.town.draft import import_town
 from parkenv.scenarios.spec import ScenarioSpec
 
 
@@ -28,7 +28,7 @@ def one_line(error, *named):
 
 DEMAND = {
     "negative arrivals": ({"arrivals_per_hour": -3}, "arrivals_per_hour is -3"),
-    "no number": ({"arrivals_per_hour": [1.0] * 23 + [float("nan")]}, "hour 23 has nan"),
+    "no number": ({"arrivals_per_hour": [1.0] * 23 + [float("nan")]}, "arrivals_per_hour.23 is nan"),
     "a class that no zone names": ({"classes": {"vip": 0.5}}, "demand.x.classes has 'vip'"),
     "a class of everybody": ({"classes": {"public": 0.5}}, "demand.x.classes has 'public'"),
     "more parked than spaces": ({"parked": 11}, "demand.x.parked is 11"),

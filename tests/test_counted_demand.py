@@ -12,10 +12,11 @@ from made_maps import FREIBURG, STREET
 from test_import_town import grid
 
 from parkenv import InputError, ParkingLot, make_scenario
-from parkenv.lots import import_town, write_lot
+from parkenv.lots import write_lot
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import read_map
+from parkenv.lots.town.draft import import_town
 from parkenv.lots.town.streets import read_streets
 from parkenv.world.facility import Facility
 from parkenv.world.scenario import drive_times

@@ -6,7 +6,6 @@ import random
 import shutil
 import tempfile
 import tomllib
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -276,10 +275,8 @@ def read(name, content, folder):
 
 
 def read_or_refuse(name, content, folder):
-    """Read a file; only an InputError may come out of it, or a word on units."""
-    with contextlib.suppress(InputError), warnings.catch_warnings():
-        # A lot that has lost its `frame` is read, and said to be in metres.
-        warnings.filterwarnings("ignore", ".* are taken for metres", UserWarning)
+    """Read a file; only an InputError may come out of it."""
+    with contextlib.suppress(InputError):
         read(name, content, folder)
 
 

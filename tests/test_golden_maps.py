@@ -26,7 +26,7 @@ from made_maps import (
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.errors import InputError
-from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.lots.generators import nearest_on_lanes
 from parkenv.world.drive_graph import SLOT_REACH
 
 GOLDENS = Path(__file__).with_name("golden_maps.json")

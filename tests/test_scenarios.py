@@ -216,7 +216,7 @@ def test_logs_and_maps(tmp_path):
         ('lot = "mini"\noccupancy = { mapping = "mine.toml" }', "want mapping only together with a log"),
         ('lot = "mini"\noccupancy = { replay_from = 2016 }', "occupancy.replay_from is 2016, want a date such as"),
         ('lot = "mini"\noccupancy = { day_error = -1 }', "occupancy.day_error.level is -1"),
-        ('lot = "mini"\noccupancy = { log = "mine.toml", day_error = 1 }', "cannot be combined with a log or counts"),
+        ('lot = "mini"\noccupancy = { log = "mine.toml", day_error = 1 }', "day_error only without a log or counts"),
         ('lot = "mini"\noccupancy = { log = "no.csv" }', "occupancy.log.0 is 'no.csv', want a file; there is none at"),
         ('lot = "mini"\nsensor_model = { hit_rate = 0.5 }', "want hit_rate and false_alarm_rate together"),
         ('lot = "mini"\nname = "a/b"', "name is 'a/b', want at most 80 printable characters without comma or slash"),

@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import dijkstra
 from parkenv import make_agent, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
-from parkenv.lots import check_lot, import_town, read_lot, write_lot
+from parkenv.lots import check_lot, read_lot, write_lot
+from parkenv.lots.town.draft import import_town
 from parkenv.mapping.route import survey_route
 from parkenv.studies.simulate import adapt_to_agent
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals

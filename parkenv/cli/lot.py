@@ -203,7 +203,6 @@ class Import(Command):
             description="Import only a square around this point, METRES to each side.",
         ),
     ] = None
-    disabled: bool = option(False, "Also import spaces for disabled drivers.")
     left_hand: bool = option(False, "Left-hand traffic, which map files do not state.")
     split: bool = option(
         False, "Find the car parks of a town and write a lot of each; entries and goals are guessed."
@@ -245,8 +244,8 @@ class Import(Command):
         require(self.town or self.car_parks is None, "--car-parks wants --town")
         require(self.car_parks or not self.listed_only, "--listed-only wants --car-parks")
         require(
-            not (self.town and (self.entry or self.goal or self.disabled)),
-            "--town has those of the map, want no --entry, --goal, --disabled",
+            not (self.town and (self.entry or self.goal)),
+            "--town has those of the map, want no --entry, --goal",
         )
         require(on_earth or not self.town, "--bounds: want SOUTH,WEST,NORTH,EAST with --town")
         return self
@@ -268,7 +267,6 @@ class Import(Command):
             guess_entry=self.split or AUTO in self.entry,
             guess_goal=self.split or AUTO in self.goal,
             bounds=self.box,
-            with_disabled=self.disabled,
         )
 
     def run(self) -> None:
@@ -276,9 +274,10 @@ class Import(Command):
             with only_writer(self.out):
                 self._import_car_parks()
             return
-        from parkenv.lots import import_lot, import_town, write_lot
+        from parkenv.lots import import_lot, write_lot
         from parkenv.lots.draft import Provenance
         from parkenv.lots.formats.geojson import check_lot_output
+        from parkenv.lots.town.draft import import_town
         from parkenv.lots.town.supply import TABLE
 
         check_lot_output(self.out)

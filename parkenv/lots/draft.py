@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
@@ -54,27 +56,18 @@ class Provenance:
 
 
 def combined_error_probability(issues: tuple[QualityIssue, ...]) -> float:
-    right = 1.0
-    for issue in issues:
-        right *= 1.0 - min(max(issue.error_probability, 0.0), 1.0)
-    return 1.0 - right
+    """Return the probability, 0 to 1, that a lot is wrong, if its issues are independent."""
+    return 1.0 - math.prod(1.0 - min(max(issue.error_probability, 0.0), 1.0) for issue in issues)
 
 
 def read_provenance(path: Path) -> Provenance | None:
-    """Return what a lot file says of its import; None if it says nothing."""
     document = read_json(path)
     origin = document.get("import") if isinstance(document, dict) else None
     if origin is None:
         return None
     try:
-        guesses, issues = origin["guesses"], origin["issues"]
-        return Provenance(
-            str(origin["source"]),
-            tuple(str(guess) for guess in guesses),
-            tuple(QualityIssue(str(issue["reason"]), float(issue["error_probability"])) for issue in issues),
-            str(origin.get("caution", "")),
-        )
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        return TypeAdapter(Provenance).validate_python(origin)
+    except ValidationError as error:
         raise InputError(
             f"{path}: import is {origin!r:.60}, want an object with source, guesses and issues"
         ) from error
@@ -102,7 +95,6 @@ class ImportOptions:
     bounds: tuple[tuple[float, float], tuple[float, float]] | None = None
     guess_entry: bool = False  # whether an entry that the file does not show may be guessed
     guess_goal: bool = False  # the same for goals
-    with_disabled: bool = False  # whether slots for disabled drivers count as slots
 
     def __post_init__(self) -> None:
         for what, points in (("goal", self.goals), ("entry", self.entries), ("bounds", self.bounds or ())):
@@ -136,6 +128,10 @@ class LeftOut:
     reason: str
     ids: tuple[str, ...]
 
+    @classmethod
+    def by_reason(cls, listed: Mapping[str, Iterable[str]]) -> tuple[LeftOut, ...]:
+        return tuple(cls(reason, tuple(ids)) for reason, ids in listed.items() if ids)
+
     def __str__(self) -> str:
         shown = ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
         return f"{self.reason}: {len(self.ids)} ({shown})"
@@ -160,8 +156,6 @@ class LotDraft:
     left_out: tuple[LeftOut, ...] = ()  # elements that were not used
     missing: tuple[str, ...] = ()  # one sentence per missing part that a search needs, with how to provide it
     frame: LocalFrame | None = None  # geographic frame of the lot; None if the file has none
-    # (k, 2) m, centres of slots whose shape is unknown; for figures
-    loose: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     facilities: tuple[Facility, ...] = ()  # counted ones need no slot here
     zone_rules: Mapping[str, Zone] = field(default_factory=dict)
     goal_weights: Mapping[str, FloatArray] = field(default_factory=dict)  # by purpose, (n_goals,)
@@ -224,7 +218,6 @@ class LotDraft:
         return replace(draft, slots=replace(slots, yaw=slots.yaw + np.pi * turned, mouth=mouth))
 
     def _without(self, lost: BoolArray, left_out: LeftOut) -> LotDraft:
-        """Return the draft without slots, (n_slots,) bool, and facilities that are left out or have no slots then."""
         kept = np.flatnonzero(~lost)
         slots = self.slots[kept]
         named = set(slots.facility.tolist())

@@ -1,4 +1,4 @@
-"""Generate lots: a grid of rows and aisles, a city of streets, and the rows of slots in both."""
+"""Slots: their columns, rows of them, generated lots (a grid, a city), and their shapes from polygons and lanes."""
 
 from __future__ import annotations
 
@@ -88,15 +88,9 @@ def bay_row(
     size: tuple[float, float] = BAY_SIZE,
     angle: float = np.pi / 2,
 ) -> Slots:
-    """Create a row of n perpendicular or angled slots on the left of a line, entered from that line.
+    """Create n perpendicular or angled slots on the left of a line along their mouths; sizes are length and width, m.
 
-    Args:
-        start: (2,) m, start of the line along the slots' mouths.
-        heading: rad, direction of that line.
-        n: number of slots.
-        size: length and width of a slot, m.
-        angle: rad, angle between the line and the parked cars; below a right angle, cars that drive along the line can
-            turn in directly.
+    Below a right `angle` between the line and the cars, those that drive along it turn in directly.
     """
     length, width = size
     along = np.array([np.cos(heading), np.sin(heading)])
@@ -123,10 +117,9 @@ NO_SLOTS = bay_row((0.0, 0.0), 0.0, 0)
 def kerb_rows(
     start: FloatArray, end: FloatArray, left: BoolArray, size: tuple[float, float] = KERB_SIZE
 ) -> tuple[Slots, NDArray[np.intp]]:
-    """Create as many kerbside slots as fit along each of m kerbs, evenly spaced; return slots and kerb indices.
+    """Create as many kerbside slots as fit along m kerbs, evenly spaced; return them and the kerb of each.
 
-    Start and end, (m, 2) m, are those of the edge between carriageway and parked cars, along which traffic runs; cars
-    park on the `left` of it, (m,) bool, or else on the right.
+    Start and end, (m, 2) m, are of the carriageway's edge in the direction of traffic; cars park on the `left` of it.
     """
     length, width = size
     reach = np.hypot(*(end - start).T)
@@ -216,8 +209,7 @@ def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
         slots = streets.kerb_slots()
         if len(slots) >= n_slots:
             break
-    rng = np.random.default_rng([seed, n_slots])
-    slots = slots[np.sort(rng.permutation(len(slots))[:n_slots])]
+    slots = slots[np.sort(np.random.default_rng([seed, n_slots]).permutation(len(slots))[:n_slots])]
 
     crossings = streets.crossings
     gate = crossings[len(crossings) // 2, 0]
@@ -238,7 +230,6 @@ def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
 
 
 def _random_streets(n_blocks: int, rng: np.random.Generator) -> StreetGrid:
-    """Draw streets around `n_blocks` × `n_blocks` blocks of 60-140 m × 50-110 m; two in five are one-way."""
     x = np.cumsum(rng.uniform(60.0, 140.0, n_blocks + 1))
     y = np.cumsum(rng.uniform(50.0, 110.0, n_blocks + 1))
     crossings = np.stack(np.meshgrid(x, y), axis=-1) + rng.uniform(-6.0, 6.0, (n_blocks + 1, n_blocks + 1, 2))
@@ -319,3 +310,65 @@ def outlines(corners: FloatArray, setback: float) -> list[FloatArray]:
     """Return closed outlines, (k, 2) m each, of the polygons `corners`, (n, k, 2) m, shrunk by `setback` m."""
     shrunk = shapely.buffer(shapely.polygons(corners), -setback, join_style="mitre")
     return [shapely.get_coordinates(polygon) for polygon in np.asarray(shrunk) if not polygon.is_empty]
+
+
+def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) -> Slots:
+    """Infer length, width, yaw and mouth of slots from their outlines, (n,) polygons with an area, m.
+
+    A slot is the smallest rectangle around its polygon. A side faces a lane if the lane's nearest point is within 60°
+    of the side's outward normal. A slot with a short side that faces a lane is perpendicular or angled, and entered by
+    that side (the nearer one of two). If only a long side faces a lane, it is a kerbside slot, and the car faces the
+    direction of traffic: that of a one-way lane, otherwise with the lane on its left. If no side faces a lane, the
+    short side nearest to one counts.
+    """
+    boxes = shapely.normalize(shapely.minimum_rotated_rectangle(polygons))
+    corners = shapely.get_coordinates(boxes).reshape(len(polygons), 5, 2)[:, :4]
+    side_length = np.hypot(*np.moveaxis(np.roll(corners, -1, axis=1) - corners, 2, 0))
+    # Make sides 0 and 2 the short ones.
+    turn = (side_length[:, 0] > side_length[:, 1])[:, None, None]
+    corners = np.where(turn, np.roll(corners, -1, axis=1), corners)
+    middle = (corners + np.roll(corners, -1, axis=1)) / 2
+    center = corners.mean(axis=1)
+    outward = middle - center[:, None]
+    half = np.hypot(outward[..., 0], outward[..., 1])
+    outward /= half[..., None]
+
+    nearest, tangent, oneway = nearest_on_lanes(lanes, middle.reshape(-1, 2))
+    to_lane = nearest.reshape(middle.shape) - middle
+    distance = np.hypot(to_lane[..., 0], to_lane[..., 1])
+    faced = np.where((to_lane * outward).sum(axis=2) >= 0.5 * distance, distance, np.inf)
+    # A lane that touches the side has no direction from it; the side counts as facing it.
+    short_faced, long_faced = (np.isfinite(np.min(faced[:, sides], axis=1)) for sides in ([0, 2], [1, 3]))
+    kerbside = np.asarray(~short_faced & long_faced)
+    by = np.where(np.asarray(short_faced | long_faced)[:, None], faced, distance)
+    side = np.where(kerbside, 1 + 2 * by[:, [1, 3]].argmin(axis=1), 2 * by[:, [0, 2]].argmin(axis=1))
+
+    row = np.arange(len(polygons))
+    mouthward = outward[row, side]
+    # For a car with this heading the mouth is on the right, for the opposite heading on the left.
+    along = np.stack([-mouthward[:, 1], mouthward[:, 0]], axis=1)
+    with_lane = (along * tangent.reshape(middle.shape)[row, side]).sum(axis=1) > 0.0
+    on_right = oneway.reshape(side_length.shape)[row, side] & with_lane
+    heading = np.where(kerbside[:, None], np.where(on_right[:, None], along, -along), -mouthward)
+    return Slots(
+        xy=center,
+        yaw=np.arctan2(heading[:, 1], heading[:, 0]),
+        length=2 * half[:, 0],
+        width=2 * half[:, 1],
+        mouth=np.where(kerbside, np.where(on_right, Mouth.RIGHT, Mouth.LEFT), Mouth.REAR).astype(np.int8),
+    )
+
+
+def nearest_on_lanes(lanes: Sequence[Lane], xy: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return the lane point nearest to each, (n, 2) m, or itself, the lane's direction, and whether it is one-way."""
+    if not lanes or not len(xy):
+        return xy, np.zeros_like(xy), np.zeros(len(xy), dtype=bool)
+    start = np.concatenate([lane.points[:-1] for lane in lanes])
+    step = np.concatenate([np.diff(lane.points, axis=0) for lane in lanes])
+    oneway = np.repeat([lane.oneway for lane in lanes], [len(lane.points) - 1 for lane in lanes])
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(np.stack([start, start + step], axis=1))))
+    leg = np.asarray(tree.nearest(np.asarray(shapely.points(xy))))
+    start, step, oneway = start[leg], step[leg], oneway[leg]
+    share = ((xy - start) * step).sum(axis=1) / (step**2).sum(axis=1)
+    nearest = start + np.clip(share, 0.0, 1.0)[:, None] * step
+    return nearest, step / np.hypot(step[:, 0], step[:, 1])[:, None], oneway

@@ -1,22 +1,28 @@
-"""Recognise lot files; read those that describe a whole lot, and the packaged lots; import the others."""
+"""Recognise, read, import and check lot files, and read the packaged lots."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from enum import Enum
 from importlib import resources
 from pathlib import Path
+from typing import Annotated, Any
 
-from parkenv.errors import InputError
+import numpy as np
+import shapely
+from pydantic import ConfigDict, Field, Strict, create_model
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from parkenv.errors import InputError, naming
 from parkenv.files.known_names import PACKAGED_LOTS
-from parkenv.files.limited_reading import is_there, read_json, unpacked_path
+from parkenv.files.limited_reading import is_there, read_json, read_yaml, unpacked_path
+from parkenv.files.spec_file import Spec
 from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
-from parkenv.lots.formats.contents import graph_errors
-from parkenv.lots.formats.dragon_lake import dragon_lake_lot
+from parkenv.lots.formats.contents import LotContents, LotProblem, graph_errors
 from parkenv.lots.formats.geojson import read_contents
+from parkenv.lots.generators import Slots, bay_row, nearest_on_lanes
 from parkenv.lots.osm.elements import holds_osm
-from parkenv.world.drive_graph import GraphError
-from parkenv.world.lot import ParkingLot
+from parkenv.world.drive_graph import GraphError, node_labels
+from parkenv.world.lot import Lane, ParkingLot
 
 
 class LotFormat(Enum):
@@ -29,7 +35,6 @@ class LotFormat(Enum):
 
     @property
     def is_complete(self) -> bool:
-        """Whether a file of this format defines a whole lot; for other formats, `import_lot` derives one by rules."""
         return self in (LotFormat.GEOJSON, LotFormat.DRAGON_LAKE)
 
 
@@ -97,7 +102,6 @@ def read_lot(path: str | Path) -> ParkingLot:
 
 
 def _read_whole(path: Path) -> tuple[ParkingLot, str]:
-    """Return the lot of a file, and what was recognised of its positions."""
     file_format = lot_format(path)
     if file_format is LotFormat.DRAGON_LAKE:
         return dragon_lake_lot(path), ""
@@ -163,3 +167,241 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
     if options.entries:
         draft = replace(draft, entries=points_in_frame(None, options.entries), entry_weights={})
     return draft
+
+
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Point = Annotated[tuple[Metres, Metres], Strict(False)]
+
+
+class _Part(Spec):
+    model_config = ConfigDict(extra="ignore")
+
+
+class _Line(_Part):
+    bounds: Annotated[tuple[Point, Point], Strict(False)]
+
+
+_NAMES = ("R1L", "R1R", "R2L", "R2R", "R3L", "R3R", "R4L", "R4R", "C1", "C2", "EXT")
+
+
+class _Rows(_Part):
+    shape: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=2)], Annotated[int, Field(ge=1, le=1000)]], Strict(False)
+    ]
+
+
+class _Area(_Part):
+    bounds: Annotated[tuple[Point, Point, Point, Point], Strict(False)]
+    areas: Annotated[tuple[_Rows, ...], Strict(False), Field(min_length=1)]
+
+
+_WAYPOINTS = create_model("_Waypoints", __base__=_Part, **dict.fromkeys(_NAMES, (_Line, ...)))  # type: ignore[call-overload]
+_MAP = create_model(
+    "_Map",
+    __base__=_Part,
+    PARKING_AREAS=(Annotated[dict[str, _Area], Field(min_length=1)], ...),
+    WAYPOINTS=(_WAYPOINTS, ...),
+)
+
+
+def dragon_lake_lot(path: Path) -> ParkingLot:
+    """Read the Dragon Lake Parking data set's `parking_map.yml`; ids are area, row from the north, column: "A-0-13".
+
+    Rows of an area are back to back; a single one opens to the nearer aisle. Aisles are the waypoint rows R1 to R4,
+    dead ends in the east; C1 and C2 connect them. Cars enter by EXT; the goal is a door at the southern end of C2.
+    """
+    document = _MAP.parse(read_yaml(path), str(path))
+    with naming(path):
+        return _lot(document)
+
+
+def _lot(document: Any) -> ParkingLot:
+    lines = {name: np.array(line.bounds) for name, line in document.WAYPOINTS}
+    aisle_y = np.array([lines[f"R{k}L"][0, 1] for k in (1, 2, 3, 4)])
+    c1, c2 = lines["C1"][0, 0], lines["C2"][0, 0]
+    outside = lines["EXT"][0]
+    lanes = [Lane(np.stack([np.full(4, x), aisle_y], axis=1)) for x in (c1, c2)]
+    for k, y in enumerate(aisle_y):
+        stops = {c1, c2, lines[f"R{k + 1}R"][:, 0].max()} | ({outside[0]} if k == 0 else set())
+        lanes.append(Lane(np.array([[x, y] for x in sorted(stops)])))
+    lanes.append(Lane(np.array([outside, [outside[0], aisle_y[0]]])))
+
+    parts: list[Slots] = []
+    slot_ids: list[str] = []
+    for name, area in document.PARKING_AREAS.items():
+        west, south = np.min(area.bounds, axis=0)
+        east, north = np.max(area.bounds, axis=0)
+        n_rows, n_columns = area.areas[0].shape
+        size = ((north - south) / n_rows, (east - west) / n_columns)
+        opens_north = np.min(np.abs(aisle_y - north)) < np.min(np.abs(aisle_y - south))
+        for row in range(n_rows):
+            if n_rows == 2:
+                opens_north = row == 0
+            # Slots are on the left of the line of their mouths, which runs west for the northern rows.
+            line = (
+                bay_row((east, north), np.pi, n_columns, size=size)
+                if opens_north
+                else bay_row((west, south), 0.0, n_columns, size=size)
+            )
+            parts.append(line[::-1] if opens_north else line)
+            slot_ids += [f"{name}-{row}-{column}" for column in range(n_columns)]
+    return ParkingLot(
+        name="dragon-lake",
+        slot_ids=tuple(slot_ids),
+        **Slots.joined(parts).columns(),
+        lanes=tuple(lanes),
+        entries=outside[None],
+        goals=np.array([[80.0, -4.0]]),
+    )
+
+
+LANE_GAP = 1.0
+"""Distance, m: a lane that ends closer to another one without a common point was probably meant to join it."""
+SLOT_OVERLAP = 0.1
+"""Smallest depth, m, of a reported overlap of two slots; smaller ones are drawing inaccuracies."""
+GOAL_REACH = 50.0  # distance, m, from the nearest lane beyond which a goal is reported
+
+
+def check_lot(path: str | Path) -> list[LotProblem]:
+    """List all errors and warnings of a lot file, errors first; none for a valid file. Does not raise.
+
+    A file with errors cannot be read. Warnings are about usable lots with probable mistakes: goals far from all lanes;
+    lanes that cross or nearly touch without a common point; slots that overlap, face away from their lane, cannot be
+    reached from an entry or do not lead to another slot; entries that do not lead to a slot.
+
+    For OpenStreetMap files and lists of slots, errors state what a search still needs, and warnings what an import
+    leaves out.
+    """
+    path = Path(path)
+    file_format = lot_format(path)
+    if file_format is not None and not file_format.is_complete:
+        return _import_problems(path)
+    if file_format is LotFormat.DRAGON_LAKE:
+        try:
+            dragon_lake_lot(path)
+        except InputError as error:
+            return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
+        return []
+    contents = read_contents(path)
+    problems = [*contents.errors, *graph_errors(contents), *_drawing_warnings(contents)]
+    if not any(problem.severity == "error" for problem in problems):
+        lot = ParkingLot(**contents.columns())
+        problems += _reach_warnings(lot, contents.numbers["slot"], contents.numbers["entry"])
+    return problems
+
+
+def _import_problems(path: Path) -> list[LotProblem]:
+    try:
+        draft = import_lot(path)
+    except InputError as error:
+        return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
+    problems = [LotProblem("error", None, text) for text in draft.missing]
+    warnings = [LotProblem("warning", None, f"left out: {left}") for left in draft.left_out]
+    if not problems:
+        try:
+            lot = draft.lot()
+        except InputError as error:
+            problems.append(LotProblem("error", None, str(error)))
+        else:
+            warnings += _reach_warnings(lot, [None] * lot.n_slots, [None] * len(lot.entries))
+    return problems + warnings
+
+
+def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
+    def warn(feature: int, message: str) -> None:
+        warnings.append(LotProblem("warning", feature, message))
+
+    warnings: list[LotProblem] = []
+    if not contents.lanes:
+        return warnings
+    slots, numbers = contents.slots, contents.numbers
+    goals = np.array(contents.goals).reshape(-1, 2)
+    to_lane = nearest_on_lanes(contents.lanes, goals)[0] - goals
+    for number, distance in zip(numbers["goal"], np.hypot(to_lane[:, 0], to_lane[:, 1]), strict=True):
+        if distance > GOAL_REACH:
+            warn(number, f"goal: the nearest lane is {distance:.0f} m away; people walk at least that far")
+
+    mouth = slots.mouths()
+    to_lane = nearest_on_lanes(contents.lanes, mouth)[0] - mouth
+    away = (to_lane * slots.outward()).sum(axis=1) < 0.0
+    for i in np.flatnonzero(away).tolist():
+        warn(numbers["slot"][i], f"slot {contents.slot_ids[i]!r:.40}: its mouth faces away from its lane")
+
+    boxes = slots.boxes(shrink=SLOT_OVERLAP)
+    one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
+    for i, j in zip(one[one < other], other[one < other], strict=True):
+        warn(
+            numbers["slot"][j],
+            f"slot {contents.slot_ids[j]!r:.40} overlaps slot {contents.slot_ids[i]!r:.40} "
+            f"of feature {numbers['slot'][i]}",
+        )
+    for lane, message in _loose_lanes(contents.lanes, numbers["lane"]):
+        warn(numbers["lane"][lane], f"lane {message}")
+    return warnings
+
+
+def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tuple[int, str]]:
+    """Yield lanes that cross or end close to each other without a common point: cars cannot turn there."""
+    count = [len(lane.points) for lane in lanes]
+    xy = np.concatenate([lane.points for lane in lanes])
+    lane_of = np.repeat(np.arange(len(lanes)), count)
+    label = node_labels(xy)
+    leg = np.flatnonzero(lane_of[:-1] == lane_of[1:])
+    legs = np.asarray(shapely.linestrings(np.stack([xy[leg], xy[leg + 1]], axis=1)))
+    tree = shapely.STRtree(legs)
+
+    one, other = tree.query(legs, predicate="intersects")
+    a, b = leg[one], leg[other]
+    joined = (label[a] == label[b]) | (label[a] == label[b + 1]) | (label[a + 1] == label[b])
+    apart = (a < b) & ~joined & (label[a + 1] != label[b + 1])
+    at = shapely.point_on_surface(shapely.intersection(legs[one[apart]], legs[other[apart]]))
+    crossed_at = np.round(shapely.get_coordinates(at), 1).tolist()
+    crossings = zip(
+        lane_of[b[apart]].tolist(), lane_of[a[apart]].tolist(), map(tuple, crossed_at), strict=True
+    )
+    for i, j, (x, y) in sorted(set(crossings)):
+        crossed = "itself" if i == j else f"the lane of feature {numbers[j]}"
+        yield i, f"crosses {crossed} at ({x:.1f}, {y:.1f}) m without a common point"
+
+    last = np.cumsum(count) - 1
+    ends = np.r_[last - count + 1, last]
+    ends = ends[np.bincount(label)[label[ends]] == 1]
+    points = np.asarray(shapely.points(xy[ends]))
+    end, near = tree.query(points, predicate="dwithin", distance=LANE_GAP)
+    gap = shapely.distance(points[end], legs[near])
+    loose = (lane_of[ends[end]] != lane_of[leg[near]]) & (gap > 0.0)
+    close = zip(lane_of[ends[end]], lane_of[leg[near]], ends[end], gap, strict=True)
+    seen: set[tuple[int, int]] = set()
+    for (i, j, point, distance), is_loose in zip(close, loose, strict=True):
+        if is_loose and (j, point) not in seen:
+            seen.add((j, point))
+            yield (
+                int(i),
+                (
+                    f"ends {distance:.2f} m from the lane of feature {numbers[j]} without a common point; "
+                    "cars cannot turn there"
+                ),
+            )
+
+
+def _reach_warnings(
+    lot: ParkingLot, numbers: Sequence[int | None], entry_numbers: Sequence[int | None]
+) -> Iterator[LotProblem]:
+    n = lot.n_slots
+    graph = lot.drive_matrix()
+    reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
+    # On the reversed graph: the vertices that lead to a slot, or belong to one.
+    to_slot = np.isfinite(dijkstra(graph.T.tocsr(), indices=np.arange(n), min_only=True))
+    _, component = connected_components(graph, connection="strong")
+    slots_in = np.bincount(component[:n], minlength=component.max() + 1)
+    source, target = graph.nonzero()
+    leaves = (component[source] != component[target]) & to_slot[target]
+    goes_on = (slots_in > 1) | (np.bincount(component[source[leaves]], minlength=len(slots_in)) > 0)
+    for fault, message in (
+        (~reached[:n], "cannot be reached from an entry"),
+        (~goes_on[component[:n]] & (n > 1), "no other slot can be reached from it"),
+    ):
+        for i in np.flatnonzero(fault).tolist():
+            yield LotProblem("warning", numbers[i], f"slot {lot.slot_ids[i]!r:.40}: {message}")
+    for i in np.flatnonzero(~to_slot[lot.entry_vertices]).tolist():
+        yield LotProblem("warning", entry_numbers[i], "entry: no slot can be reached from it")

@@ -23,8 +23,8 @@ from parkenv.lots.draft import (
     read_provenance,
 )
 from parkenv.lots.formats.contents import LotProblem
+from parkenv.lots.generators import nearest_on_lanes
 from parkenv.lots.osm.draft import import_car_parks
-from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.show.figures.lots import save_census, save_contact_sheets
 from parkenv.show.plurals import plural
 from parkenv.studies.results import Row

@@ -5,7 +5,7 @@ from packaged import LOTS, PACKAGED, build
 
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.lots import packaged_lot
-from parkenv.lots.checks import check_lot
+from parkenv.lots.lot_files import check_lot
 
 
 @pytest.fixture(scope="module")

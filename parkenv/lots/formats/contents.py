@@ -11,21 +11,20 @@ The member `zones` of the file has an object for each zone with rules; all of it
 | `users` | list of classes of users, `["public"]` if absent |
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
+from pydantic import ConfigDict, Field, Strict
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, nearest, require_number
 from parkenv.files.file_names import is_plain
-from parkenv.lots.generators import NO_SLOTS, Slots
+from parkenv.files.spec_file import Spec
+from parkenv.lots.generators import NO_SLOTS, Slots, slots_from_polygons
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.slot_polygons import slots_from_polygons
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
 from parkenv.world.facility import Facility
 from parkenv.world.lot import FARTHEST, SLOT_SIDE, Lane, Mouth, ParkingLot, Turn
@@ -41,6 +40,8 @@ KINDS = {
     "turn": ("LineString",),
 }
 """The kinds of features, and the geometry types allowed for each."""
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+Side = Annotated[float, Field(ge=SLOT_SIDE, le=FARTHEST)]
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,6 @@ class LotProblem:
 
 @dataclass(frozen=True)
 class RawFeature:
-    """A feature with a valid geometry: its parts are slices of one array of all positions."""
-
     number: int
     kind: str
     properties: dict[str, Any]
@@ -206,15 +205,13 @@ def zone_document(zone: Zone) -> dict[str, Any]:
     return document | {"users": list(zone.users)}
 
 
-def read_zone(properties: dict[str, Any], what: str, rules: Collection[str]) -> str:
+def read_zone(properties: dict[str, Any], rules: Collection[str]) -> str:
     """Return the zone of a feature, empty text if not given; where the file has rules, one of those zones."""
     zone = properties.get("zone", "")
     if not isinstance(zone, str) or not is_plain(zone) or ("zone" in properties and not zone):
-        raise InputError(f"{what}: zone is {zone!r:.40}, want a name")
+        raise InputError(f"zone is {zone!r:.40}, want a name")
     if zone and rules and zone != NO_ZONE and zone not in rules:
-        raise InputError(
-            f"{what}: zone is {zone!r:.40}, want one of the file's zones; {nearest(zone, rules)}"
-        )
+        raise InputError(f"zone is {zone!r:.40}, want one of the file's zones; {nearest(zone, rules)}")
     return zone
 
 
@@ -248,7 +245,7 @@ def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray
                 )
                 contents.numbers["facility"].append(feature.number)
                 seen.add(str(name))
-            read_zone(given, f"facility {name!r:.40}", contents.zone_rules)
+                read_zone(given, contents.zone_rules)
         except InputError as error:
             contents.error(feature.number, str(error))
 
@@ -272,8 +269,22 @@ def read_weights(feature: RawFeature) -> dict[str, float]:
     return {purpose: float(weight) for purpose, weight in weights.items()}
 
 
-SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")  # the properties that define a slot exactly
-MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
+class SlotShape(Spec):
+    """The properties that define a slot exactly."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    center: Annotated[tuple[Coordinate, Coordinate], Strict(False)]
+    yaw: Coordinate
+    length: Side
+    width: Side
+    mouth: Literal["rear", "left", "right"]
+
+    def row(self) -> tuple[float, ...]:
+        return (*self.center, self.yaw, self.length, self.width, Mouth[self.mouth.upper()])
+
+
+SLOT_SHAPE = tuple(SlotShape.model_fields)
 SLOT_AGREEMENT = 0.01  # largest distance, m, between a slot's polygon and the rectangle of its properties
 
 
@@ -286,51 +297,48 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
     polygons = np.asarray(shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=which)))
     area = shapely.area(shapely.convex_hull(polygons))
     valid = shapely.is_valid(polygons)
-    first_with: dict[str, int] = {}
-    valid_rows: list[int] = []
-    ids: list[str] = []
-    shapes: list[tuple[float, ...] | None] = []
-    costs: list[float] = []
-    zones: list[str] = []
-    facilities: list[str] = []
     drawn = dict.fromkeys(place.name for place in contents.facilities if not place.is_counted)
-    first_with |= {
-        facility.name: contents.numbers["facility"][i]
-        for i, facility in enumerate(contents.facilities)
-        if facility.is_counted
+    first_with = {
+        place.name: number
+        for place, number in zip(contents.facilities, contents.numbers["facility"], strict=True)
+        if place.is_counted
     }
+    rows: list[tuple[int, str, SlotShape | None, float, str, str]] = []
     for i, feature in enumerate(raw):
+        given = feature.properties
         try:
             slot_id = _slot_id(feature)
             if slot_id in first_with:
                 raise InputError(f"slot: id {slot_id!r:.40} appears already in feature {first_with[slot_id]}")
             first_with[slot_id] = feature.number
-            if area[i] < SLOT_SIDE**2:
-                raise InputError(f"slot {slot_id!r:.40}: the polygon is flat, want an area to park on")
-            if not valid[i]:
-                reason = shapely.is_valid_reason(polygons[i])
-                raise InputError(f"slot {slot_id!r:.40}: the polygon is not a simple one: {reason}")
-            cost = _parking_cost(feature.properties, slot_id)
-            zone = read_zone(feature.properties, f"slot {slot_id!r:.40}", contents.zone_rules)
-            facility = _facility(feature.properties, slot_id, drawn)
-            shapes.append(_slot_shape(feature.properties, slot_id) if exact else None)
+            with naming(f"slot {slot_id!r:.40}"):
+                if area[i] < SLOT_SIDE**2:
+                    raise InputError("the polygon is flat, want an area to park on")
+                if not valid[i]:
+                    reason = shapely.is_valid_reason(polygons[i])
+                    raise InputError(f"the polygon is not a simple one: {reason}")
+                cost, facility = given.get("parking_cost_s", 0.0), given.get("facility", "")
+                require_number("parking_cost_s", cost, least=0.0, most=FARTHEST)
+                if "facility" in given and not (isinstance(facility, str) and facility in drawn):
+                    hint = nearest(str(facility), drawn)
+                    raise InputError(
+                        f"facility is {facility!r:.40}, want that of a feature without a capacity; {hint}"
+                    )
+                has_shape = exact and any(name in given for name in SLOT_SHAPE)
+                shape = SlotShape.parse(given, "") if has_shape else None
+                rows.append((i, slot_id, shape, cost, read_zone(given, contents.zone_rules), facility))
         except InputError as error:
             contents.error(feature.number, str(error))
-            continue
-        valid_rows.append(i)
-        ids.append(slot_id)
-        costs.append(cost)
-        zones.append(zone)
-        facilities.append(facility)
+    valid_rows, ids, shapes, costs, zones, facilities = zip(*rows, strict=True) if rows else ((),) * 6
 
-    polygons = polygons[valid_rows]
+    polygons = polygons[list(valid_rows)]
     bare = np.array([shape is None for shape in shapes], dtype=bool)
     slots = slots_from_polygons(polygons[bare], contents.lanes)
     if not bare.all():
         # x, y, yaw, length, width, mouth
         table = np.empty((len(valid_rows), 6))
         table[bare] = np.column_stack([slots.xy, slots.yaw, slots.length, slots.width, slots.mouth])
-        table[~bare] = [shape for shape in shapes if shape is not None]
+        table[~bare] = [shape.row() for shape in shapes if shape is not None]
         slots = Slots(table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5].astype(np.int8))
 
     apart = shapely.hausdorff_distance(polygons, slots.boxes())
@@ -360,44 +368,7 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
 
 def _slot_id(feature: RawFeature) -> str:
     given = feature.number if feature.given_id is None else feature.given_id
-    if type(given) is int:
-        return str(given)
+    given = str(given) if type(given) is int else given
     if not isinstance(given, str) or not given or not is_plain(given):
         raise InputError(f"slot: id is {given!r:.40}, want a text")
     return given
-
-
-def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
-    cost = properties.get("parking_cost_s", 0.0)
-    if not is_coordinate(cost) or cost < 0.0:
-        raise InputError(f"slot {slot_id!r:.40}: parking_cost_s is {cost!r:.40}, want seconds, at least 0")
-    return float(cost)
-
-
-def _facility(properties: dict[str, Any], slot_id: str, drawn: Collection[str]) -> str:
-    facility = properties.get("facility", "")
-    if not (isinstance(facility, str) and facility in drawn) and "facility" in properties:
-        hint = nearest(str(facility), drawn)
-        raise InputError(
-            f"slot {slot_id!r:.40}: facility is {facility!r:.40}, want that of a feature without a capacity; {hint}"
-        )
-    return str(facility)
-
-
-def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:
-    absent = [name for name in SLOT_SHAPE if name not in properties]
-    if len(absent) == len(SLOT_SHAPE):
-        return None
-    if absent:
-        raise InputError(f"slot {slot_id!r:.40}: no {absent[0]}, want all of {', '.join(SLOT_SHAPE)} or none")
-    center, yaw, length, width, mouth = (properties[name] for name in SLOT_SHAPE)
-    if not (isinstance(center, list) and len(center) == 2 and all(map(is_coordinate, center))):
-        raise InputError(f"slot {slot_id!r:.40}: center is {center!r:.40}, want two finite numbers")
-    if not is_coordinate(yaw):
-        raise InputError(f"slot {slot_id!r:.40}: yaw is {yaw!r:.40}, want a finite number")
-    for name, value in (("length", length), ("width", width)):
-        if not is_coordinate(value) or value < SLOT_SIDE:
-            raise InputError(f"slot {slot_id!r:.40}: {name} is {value!r:.40}, want at least {SLOT_SIDE:g} m")
-    if not isinstance(mouth, str) or mouth not in MOUTHS:
-        raise InputError(f"slot {slot_id!r:.40}: mouth is {mouth!r:.40}, want one of {', '.join(MOUTHS)}")
-    return (*center, yaw, length, width, MOUTHS[mouth])

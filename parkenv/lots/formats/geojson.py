@@ -3,8 +3,7 @@
 The native file is a GeoJSON FeatureCollection with the additional members
 `"parkenv": {"format": "lot", "version": 1}`, `"name"` and `"frame": "local"` (metres). Without
 `frame`, positions are longitude and latitude (RFC 7946) or those of the map grid that `crs` names, and are projected
-to metres east and north of the centre of the features; metres without either are recognised by their size
-(`parkenv.lots.formats.positions`). `properties.kind` is the kind of a feature:
+to metres east and north of the centre of the features. `properties.kind` is the kind of a feature:
 
 | kind | geometry | properties |
 |---|---|---|
@@ -27,15 +26,17 @@ A file made by an import may have the member `import`: its source, what was gues
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, with_extra
 from parkenv.files.atomic_write import check_writable, write_text
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
@@ -53,7 +54,6 @@ from parkenv.lots.formats.contents import (
     read_zones,
     zone_document,
 )
-from parkenv.lots.formats.positions import Positions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, Turn, is_building
 
@@ -83,8 +83,7 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
     if lot.zone_rules:
         head["zones"] = {name: zone_document(zone) for name, zone in lot.zone_rules.items()}
     features = ",\n".join(json.dumps(feature) for feature in _features(lot))
-    text = f'{json.dumps(head)[:-1]},\n"features": [\n{features}\n]}}\n'
-    write_text(path, text)
+    write_text(path, f'{json.dumps(head)[:-1]},\n"features": [\n{features}\n]}}\n')
 
 
 def check_lot_output(path: Path) -> None:
@@ -161,9 +160,13 @@ def read_contents(path: Path) -> LotContents:
     """Read all valid features of a file, and record all errors. Does not raise."""
     contents = LotContents(path.stem)
     try:
-        document = _load(path)
+        if path.suffix.lower() not in (".geojson", ".json"):
+            raise InputError(
+                f"unknown kind of file {path.suffix!r}, want .geojson, .json or a Dragon Lake .yml"
+            )
+        document = read_json(path)
         contents.name = _check_head(document, path.stem)
-        system = Positions(True) if "frame" in document else Positions.of(document, path)
+        system = Positions(True) if "frame" in document else Positions.of(document)
         contents.found = system.found
         traffic = document.get("traffic", "right")
         if traffic not in ("left", "right"):
@@ -171,7 +174,7 @@ def read_contents(path: Path) -> LotContents:
         contents.left_hand = traffic == "left"
         contents.zone_rules = read_zones(document.get("zones", {}))
     except InputError as error:
-        contents.error(None, str(error))
+        contents.error(None, str(error).removeprefix(f"{path}: "))
         return contents
 
     raw: list[RawFeature] = []
@@ -238,15 +241,6 @@ def _add_feature(contents: LotContents, feature: RawFeature, parts: list[FloatAr
         points = contents.entries if feature.kind == "entry" else contents.goals
         points.append(parts[0][0])
     contents.numbers[feature.kind].append(feature.number)
-
-
-def _load(path: Path) -> Any:
-    if path.suffix.lower() not in (".geojson", ".json"):
-        raise InputError(f"unknown kind of file {path.suffix!r}, want .geojson, .json or a Dragon Lake .yml")
-    try:
-        return read_json(path)
-    except InputError as error:
-        raise InputError(str(error).removeprefix(f"{path}: ")) from error
 
 
 def _check_head(document: Any, stem: str) -> str:
@@ -319,3 +313,116 @@ def _position(kind: str, position: Any) -> tuple[float, float]:
     if isinstance(position, list) and len(position) >= 2 and all(map(is_coordinate, position)):
         return float(position[0]), float(position[1])
     raise InputError(f"{kind}: position {position!r:.60}, want two finite numbers, at most {FARTHEST:.0e}")
+
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
+
+LARGEST_DEGREES = 0.05
+"""Extent, degrees, that no outline of parking exceeds (5 km); in metres all are larger than that."""
+_CRS = re.compile(
+    r"(?:urn:ogc:def:crs:|https?://www\.opengis\.net/def/crs/)?(EPSG|OGC|ESRI)[:/].*?([A-Za-z0-9]+)"
+)
+_ADVICE = (
+    'give the file "frame": "local" for metres, or "crs": '
+    '{"type": "name", "properties": {"name": "EPSG:25832"}} with its own code for a map grid'
+)
+
+
+@dataclass(frozen=True)
+class Positions:
+    """What a file's pairs of numbers are."""
+
+    in_metres: bool = (
+        False  # east and north in a frame of the file's own; else `to_lonlat` converts them to degrees
+    )
+    found: str = ""  # which map grid they are in, one line; else empty
+    frame: LocalFrame | None = None  # of a file in metres, with its middle at longitude and latitude 0
+    _grid: Transformer | None = None
+
+    @property
+    def converts(self) -> bool:
+        return self.frame is not None or self._grid is not None
+
+    def to_lonlat(self, points: FloatArray) -> FloatArray:
+        """Convert the file's positions, (n, 2), to longitude and latitude, degrees; of metres around (0, 0)."""
+        if self.frame is not None:
+            return self.frame.to_lonlat(points)
+        if self._grid is None or not len(points):
+            return points
+        return np.column_stack(self._grid.transform(points[:, 0], points[:, 1]))
+
+    @classmethod
+    def of(cls, document: dict[str, Any]) -> Positions:
+        """Recognise the positions of a FeatureCollection by `frame` and `crs`; others are degrees."""
+        rings = _outlines(document)
+        if "frame" in document:
+            xy = np.concatenate([*rings, np.zeros((0 if rings else 1, 2))])
+            middle = 0.5 * (xy.min(axis=0) + xy.max(axis=0))
+            return cls(True, frame=LocalFrame(0.0, 0.0, tuple(middle.tolist())))
+        if (grid := _grid(document.get("crs"))) is not None:
+            xy = np.concatenate([*rings, np.empty((0, 2))])
+            there_and_back = grid[0].transform(*grid[0].transform(xy[:, 0], xy[:, 1]), direction="INVERSE")
+            # Far beyond a grid's own area a projection repeats itself.
+            if not np.allclose(there_and_back, xy.T, rtol=0.0, atol=1.0):
+                raise InputError(
+                    f"crs is {grid[1]}, in which the positions lie nowhere on the globe; {_ADVICE}"
+                )
+            return cls(found=f"positions are in {grid[1]}, as the file's crs says", _grid=grid[0])
+        # The smaller side: a ring across the date line is 360° long.
+        if rings and float(np.median([np.ptp(ring, axis=0).min() for ring in rings])) > LARGEST_DEGREES:
+            raise InputError(f"outlines are wider than {LARGEST_DEGREES:g}, too wide for degrees; {_ADVICE}")
+        return cls()
+
+
+def _outlines(document: dict[str, Any]) -> list[FloatArray]:
+    """Return the outer rings of polygons, (k, 2), else all other positions; the reader complains of wrong ones."""
+    rings: list[FloatArray] = []
+    others: list[FloatArray] = []
+    for feature in document["features"] if isinstance(document.get("features"), list) else ():
+        geometry = feature.get("geometry") if isinstance(feature, dict) else None
+        if not isinstance(geometry, dict):
+            continue
+        shape: Any = geometry.get("type")
+        line: Any = geometry.get("coordinates")
+        try:
+            for _ in range({"Polygon": 1, "MultiPolygon": 2}.get(shape, 0)):
+                line = line[0]
+            positions = [line] if shape == "Point" else line
+            ring = np.array([p[:2] for p in positions], dtype=np.float64).reshape(-1, 2)
+        except (TypeError, ValueError, LookupError, OverflowError):
+            continue
+        if np.isfinite(ring).all() and len(ring):
+            (rings if shape in ("Polygon", "MultiPolygon") else others).append(ring)
+    return rings or ([np.concatenate(others)] if others else [])
+
+
+def _grid(crs: object) -> tuple[Transformer, str] | None:
+    """Return the transformation of a file's `crs` to WGS 84, and its title; None for longitude and latitude itself."""
+    if crs is None:
+        return None
+    properties = crs.get("properties") if isinstance(crs, dict) else None
+    name = properties.get("name") if isinstance(properties, dict) else None
+    if not isinstance(name, str):
+        raise InputError(
+            f'crs is {crs!r:.80}, want {{"type": "name", "properties": {{"name": "EPSG:25832"}}}} or none'
+        )
+    with with_extra(f"crs {name:.80}", "osm"):
+        from pyproj import CRS, Transformer
+        from pyproj.exceptions import CRSError
+
+    match = _CRS.fullmatch(name)
+    try:
+        # Only codes: other texts may name files and pipelines.
+        if match is None:
+            raise CRSError("no code")
+        code = ":".join(match.groups())
+        if code in ("OGC:CRS84", "EPSG:4326"):
+            return None
+        system = CRS.from_user_input(code)
+        return Transformer.from_crs(system, "OGC:CRS84", always_xy=True), f"{code} ({system.name})"
+    except CRSError as error:
+        raise InputError(
+            f"crs is {name!r:.80}, want the code of a known system, such as EPSG:25832, or longitude and latitude "
+            "and no crs (any GIS converts: save as EPSG:4326)"
+        ) from error

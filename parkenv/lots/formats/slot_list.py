@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.errors import InputError
-from parkenv.files.file_names import is_plain
-from parkenv.files.limited_reading import csv_rows
+from parkenv.errors import InputError, naming
+from parkenv.files.field_types import Name
+from parkenv.files.limited_reading import csv_records
+from parkenv.files.spec_file import Spec
 from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
-from parkenv.lots.generators import KERB_SIZE, NO_SLOTS, Slots
+from parkenv.lots.generators import KERB_SIZE, Slots
 from parkenv.lots.infer.layout import InferredLot, draft_inferred_lot, infer_lot
-from parkenv.lots.infer.spaces import CenterRow, Spaces, describe_rows, spaces_from_centers
+from parkenv.lots.infer.spaces import Spaces, spaces_from_centers
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.lot import Mouth
 
-COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s", "zone")
 SAME_PLACE = 0.1  # distance, m, within which two slot centres are one slot listed twice
 
 
@@ -40,6 +43,22 @@ class SlotList:
         return SlotList(ids, self.xy[index], yaw, self.parking_cost_s[index], self.zone[index], self.frame)
 
 
+Metres = Annotated[float, Field(ge=-1e8, le=1e8)]
+
+
+class _Row(Spec):
+    model_config = ConfigDict(strict=False, str_strip_whitespace=True)
+
+    x: Metres | None = None
+    y: Metres | None = None
+    lat: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
+    lon: Annotated[float, Field(ge=-180.0, le=180.0)] | None = None
+    yaw: Metres | None = None
+    id: Annotated[str, Field(min_length=1)] | None = None
+    parking_cost_s: Annotated[float, Field(ge=0.0, le=1e8)] = 0.0
+    zone: Name = ""
+
+
 def read_slot_list(path: str | Path) -> SlotList:
     """Read a CSV file of slot centres.
 
@@ -48,69 +67,39 @@ def read_slot_list(path: str | Path) -> SlotList:
     `parking_cost_s`, the parking cost in seconds (by default 0), and `zone`, the tariff zone (by default none).
     """
     path = Path(path)
-    rows = [row for _, row in csv_rows(path) if any(cell.strip() for cell in row)]
-    head = [cell.strip().lower() for cell in rows[0]] if rows else []
-    unknown = [name for name in head if name not in COLUMNS]
-    pairs = [pair for pair in (("x", "y"), ("lat", "lon")) if set(pair) <= set(head)]
-    if len(pairs) != 1 or unknown or len(set(head)) < len(head):
-        raise InputError(
-            f"{path}: columns are {','.join(head)!r:.80}, want x,y or lat,lon, and perhaps yaw, id, "
-            "parking_cost_s and zone"
-        )
-    if len(rows) == 1:
+    records = (record for _, record in csv_records(path) if any(text.strip() for text in record.values()))
+    rows: dict[str, _Row] = {}
+    for number, record in enumerate(records, start=2):
+        with naming(f"{path}: row {number}"):
+            row = _Row.parse({name.strip().lower(): text for name, text in record.items()}, "")
+            name = row.id or str(number)
+            if name in rows:
+                raise InputError(f"id {name!r:.40} appears already in row {list(rows).index(name) + 2}")
+            given = [column for column in ("x", "y", "lat", "lon") if getattr(row, column) is not None]
+            if given not in (["x", "y"], ["lat", "lon"]):
+                raise InputError(f"columns are {','.join(record)!r:.80}, want x,y or lat,lon")
+        rows[name] = row
+    if not rows:
         raise InputError(f"{path}: no slot below the line of columns")
-
-    bounds = {"lat": 90.0, "lon": 180.0}
-    values: dict[str, list[float]] = {name: [] for name in head if name not in ("id", "zone")}
-    zones: list[str] = []
-    ids: dict[str, int] = {}
-    for number, row in enumerate(rows[1:], start=2):
-        cells = dict(zip(head, (cell.strip() for cell in row), strict=True))
-        name = cells.get("id", str(number))
-        if not name or name in ids:
-            where = f"appears already in row {ids[name]}" if name else "is empty"
-            raise InputError(f"{path}: row {number}: id {name!r:.40} {where}")
-        ids[name] = number
-        zones.append(cells.get("zone", ""))
-        if not is_plain(zones[-1]):
-            raise InputError(f"{path}: row {number}: zone is {zones[-1]!a:.40}, want a name")
-        for column in values:
-            try:
-                value = float(cells[column])
-            except ValueError:
-                value = np.nan
-            most = bounds.get(column, 1e8)
-            least = 0.0 if column == "parking_cost_s" else -most
-            if not least <= value <= most:
-                raise InputError(
-                    f"{path}: row {number}: {column} is {cells[column]!r:.40}, want a number from {least:g} to {most:g}"
-                )
-            values[column].append(value)
-    points = np.column_stack([values[name] for name in pairs[0]])
     frame = None
-    if pairs[0] == ("lat", "lon"):
-        frame = LocalFrame.around(points[:, ::-1])
-        points = frame.to_xy(points[:, ::-1])
-    names = tuple(ids)
-    _require_apart(path, points, names, tuple(ids.values()))
-    yaw = np.array(values["yaw"]) if "yaw" in values else None
-    cost = np.array(values.get("parking_cost_s", [0.0] * len(names)))
-    return SlotList(names, points, yaw, cost, np.array(zones, np.str_), frame)
-
-
-def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple[int, ...]) -> None:
-    from scipy.spatial import cKDTree
-
-    same = cKDTree(xy).query_pairs(SAME_PLACE, output_type="ndarray")
+    if row.lat is None:
+        points = np.array([(row.x, row.y) for row in rows.values()], np.float64)
+    else:
+        lonlat = np.array([(row.lon, row.lat) for row in rows.values()], np.float64)
+        frame = LocalFrame.around(lonlat)
+        points = frame.to_xy(lonlat)
+    same = cKDTree(points).query_pairs(SAME_PLACE, output_type="ndarray")
     if len(same):
         i, j = sorted(same[np.lexsort(np.sort(same, axis=1).T)[0]].tolist())
-        raise InputError(
-            f"{path}: row {rows[j]}: slot {ids[j]!r:.40} lies where slot {ids[i]!r:.40} of row {rows[i]} is"
-        )
+        names = list(rows)
+        raise InputError(f"{path}: row {j + 2}: slot {names[j]!r:.40} lies where slot {names[i]!r:.40} is")
+    yaw = None if row.yaw is None else np.array([row.yaw for row in rows.values()])
+    cost = np.array([row.parking_cost_s for row in rows.values()])
+    return SlotList(tuple(rows), points, yaw, cost, np.array([row.zone for row in rows.values()]), frame)
 
 
 def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
-    """Draft a lot from a list of slots; where no lanes can be inferred it has their centres alone, and says why."""
+    """Draft a lot from a list of slots; its lanes are inferred from rows of rectangles."""
     path = Path(path)
     options = options or ImportOptions()
     listed = read_slot_list(path)
@@ -121,9 +110,8 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
             raise InputError(f"{path}: no slot within the bounds {', '.join(f'{b:g}' for b in box)} m")
         listed = listed.subset(np.flatnonzero(inside))
     entries, goals = (points_in_frame(listed.frame, given) for given in (options.entries, options.goals))
-    rows: list[CenterRow] = []
-    try:
-        spaces, index, rows = spaces_from_centers(listed.ids, listed.xy, listed.yaw)
+    with naming(path):
+        spaces, index = spaces_from_centers(listed.ids, listed.xy, listed.yaw)
         lot = _infer_along_rows(spaces, entries)
         strays = np.setdiff1d(np.arange(len(listed.ids)), index)
         draft = draft_inferred_lot(
@@ -137,22 +125,7 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
             frame=listed.frame,
             goals=goals,
         )
-    except InputError as error:
-        draft = LotDraft(
-            name=path.stem,
-            slot_ids=(),
-            slots=NO_SLOTS,
-            slot_source=(),
-            lanes=(),
-            entries=entries,
-            goals=goals,
-            outlines=tuple(listed.xy[row.members[[0, -1]]] for row in rows),
-            loose=listed.xy,
-            missing=(f"no aisles: {error}",),
-            frame=listed.frame,
-        )
-    found = [f"{len(listed.ids)} slot centres", *([describe_rows(rows)] if rows else [])]
-    return replace(draft, found=(*found, *draft.found))
+    return replace(draft, found=(f"{len(listed.ids)} slot centres", *draft.found))
 
 
 def _infer_along_rows(spaces: Spaces, entries: FloatArray) -> InferredLot:

@@ -1,20 +1,251 @@
-"""Aisles: centre lines before the open sides of rows, shared by rows that face or continue each other."""
-
-from __future__ import annotations
+"""The side on which each row of spaces opens, and aisles: centre lines before open sides, shared by facing rows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter, minimum_filter1d
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.lots.infer.openings import WIDEST_SHARED, OpenRow, is_on_road
-from parkenv.lots.infer.spaces import Spaces
-from parkenv.world.drive_graph import component_labels
+from parkenv.lots.infer.spaces import Row, Spaces
+from parkenv.world.drive_graph import SLOT_REACH, component_labels
+
+LOOK = 18.0  # how far ahead of a mouth obstacles are looked for, m
+WIDEST_SHARED = 13.0  # widest aisle, m, that two facing rows share
+LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.7, 3.9
+"""Least width, m, of an aisle along kerbside and along perpendicular spaces; oblique ones are in between."""
+TOLERATED, TOLERATED_ACROSS = 0.75, 0.95
+"""Fraction of that width that is enough before single spaces of an oblique and of a perpendicular row."""
+EXHAUSTIVE = 14  # undecided rows up to which all combinations of sides are tried
+PREFERRED = 0.3  # gain per space of a row that opens to the side that its spaces prefer
+ON_ROAD = 4.0  # gain per space of a row that opens to a road of the map
+ALONE, UNUSED, SHARED = 0.55, 0.45, 1.0
+"""Costs per space of a row that opens to free ground, of a gap as wide as an aisle that nothing opens to, and the gain
+per space of two rows that share an aisle."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What lies ahead of the mouths of a row, on one side."""
+
+    clear: FloatArray  # (k,) m to the nearest obstacle, at most `LOOK`
+    hit: IntArray  # (k,) the space that the middle of the view ends at; -1 for none
+
+
+@dataclass(frozen=True, eq=False)
+class OpenRow:
+    """A row, the side that it opens to, and how sure that is (0 to 1)."""
+
+    row: Row
+    side: int
+    view: View
+    certainty: float
+
+
+def least_aisle(row: Row) -> float:
+    return LEAST_KERBSIDE + (LEAST_PERPENDICULAR - LEAST_KERBSIDE) * float(np.sin(row.slant)) ** 2
+
+
+def open_rows(
+    spaces: Spaces,
+    rows: Sequence[Row],
+    obstacles: Sequence[shapely.Geometry],
+    roads: Sequence[FloatArray] = (),
+) -> tuple[list[OpenRow], IntArray]:
+    """Return the rows with their open sides, divided where these differ, and the spaces that no aisle can reach."""
+    shapes = np.concatenate([spaces.boxes(shrink=0.1), np.array(list(obstacles), dtype=object)])
+    tree = shapely.STRtree(shapes)
+    parts: list[tuple[Row, list[View]]] = []
+    lost: list[int] = []
+    for row in rows:
+        views = [_view(spaces, shapes, tree, row, side) for side in (0, 1)]
+        wanted = np.stack([_agreement(spaces, row, side) for side in (0, 1)], axis=1)
+        is_open = np.stack([_is_open(view.clear, row) for view in views], axis=1) & (wanted > -0.7)
+        if len(row) == 1 and not is_open.any():
+            lost += row.members.tolist()
+            continue
+        for index in _runs(is_open):
+            index = index[is_open[index].any(axis=1)]
+            if len(index):
+                parts.append((row.part(index), [View(v.clear[index], v.hit[index]) for v in views]))
+        lost += row.members[~is_open.any(axis=1)].tolist()
+    sides, certainty = _choose(spaces, parts, roads)
+    opened = [
+        OpenRow(row, side, views[side], sure)
+        for (row, views), side, sure in zip(parts, sides, certainty, strict=True)
+    ]
+    return opened, np.array(sorted(lost), dtype=np.int64)
+
+
+def _view(spaces: Spaces, shapes: NDArray[np.object_], tree: shapely.STRtree, row: Row, side: int) -> View:
+    k, n = len(row), len(spaces)
+    normal = row.normal(side)
+    mouths = row.mouths(spaces, side)
+    clear, hits = np.full((3, k), LOOK), np.full((3, k), -1)
+    for j, share in enumerate((0.0, -0.3, 0.3)):
+        start = mouths + share * row.pitch[:, None] * row.along
+        rays = np.asarray(shapely.linestrings(np.stack([start, start + LOOK * normal], axis=1)))
+        ray, shape = tree.query(rays, predicate="intersects")
+        # The row itself ends no view, except around a tight bend.
+        position = np.full(len(shapes), -(10**6))
+        position[row.members] = np.arange(k)
+        other = np.abs(position[shape] - ray) > 3
+        ray, shape = ray[other], shape[other]
+        far = shapely.distance(
+            np.asarray(shapely.points(start))[ray], shapely.intersection(rays[ray], shapes[shape])
+        )
+        order = np.lexsort((shape, far))[::-1]
+        clear[j, ray[order]] = far[order]
+        hits[j, ray[order]] = np.where(shape[order] < n, shape[order], -1)
+    return View(clear=np.minimum(clear[0], np.median(clear, axis=0)), hit=hits[0])
+
+
+def _runs(is_open: NDArray[np.bool_]) -> list[IntArray]:
+    runs: list[list[int]] = [[]]
+    common = np.array([True, True])
+    for i, sides in enumerate(is_open):
+        if sides.any():
+            if not (common & sides).any():
+                runs.append([])
+                common = np.array([True, True])
+            common &= sides
+        runs[-1].append(i)
+    return [np.array(run) for run in runs]
+
+
+def is_on_road(
+    spaces: Spaces, row: Row, side: int, view: View, roads: Sequence[FloatArray]
+) -> NDArray[np.bool_]:
+    if not len(roads):
+        return np.zeros(len(row), dtype=bool)
+    mouths = row.mouths(spaces, side)
+    reach = np.minimum(view.clear, SLOT_REACH - 0.1)[:, None]
+    rays = np.asarray(shapely.linestrings(np.stack([mouths, mouths + reach * row.normal(side)], axis=1)))
+    lines = shapely.multilinestrings([shapely.LineString(road) for road in roads])
+    return np.asarray(shapely.intersects(rays, lines))
+
+
+def _is_open(clear: FloatArray, row: Row) -> NDArray[np.bool_]:
+    """Whether cars reach spaces from a side, (k,): where most of a row has the width that it needs, less is enough."""
+    need = least_aisle(row)
+    tolerated = TOLERATED if row.slant < np.radians(75.0) else TOLERATED_ACROSS
+    return clear >= (tolerated * need if np.median(clear) >= need else need)
+
+
+def _agreement(spaces: Spaces, row: Row, side: int) -> FloatArray:
+    """How well a side agrees with the known open sides of spaces, (k,): 1, -1, half of these, or 0 if none is known."""
+    if spaces.opens is None:
+        return np.zeros(len(row))
+    return np.asarray((spaces.opens[row.members] * row.outward(side)).sum(axis=1))
+
+
+def _choose(
+    spaces: Spaces, parts: Sequence[tuple[Row, list[View]]], roads: Sequence[FloatArray]
+) -> tuple[list[int], list[float]]:
+    """Choose sides of least cost: rows share aisles where they can, and no gap like an aisle stays unused."""
+    n = len(parts)
+    owner = np.full(len(spaces), -1)
+    for r, (row, _) in enumerate(parts):
+        owner[row.members] = r
+    unary = np.zeros((n, 2))
+    pairs: dict[tuple[int, int], FloatArray] = {}
+    for r, (row, views) in enumerate(parts):
+        need = least_aisle(row)
+        for side, view in enumerate(views):
+            wanted = _agreement(spaces, row, side)
+            shut = ~_is_open(view.clear, row) | (wanted < -0.7)
+            unary[r, side] -= PREFERRED * float(wanted.sum())
+            if shut.any():
+                unary[r, side] += np.inf
+                continue
+            # How much a gap is like an aisle: most from 5 to 7.5 m.
+            widths = [need - 0.01, need, 4.5, 5.2, 7.5, WIDEST_SHARED, LOOK]
+            like = np.interp(view.clear, widths, [0.0, 0.25, 0.8, 1.0, 1.0, 0.35, 0.2])
+            facing = np.zeros(len(row), dtype=bool)
+            for k in np.flatnonzero(view.hit >= 0).tolist():
+                other = int(owner[view.hit[k]])
+                if other < 0 or other == r:
+                    continue
+                opposite = parts[other][0]
+                j = int(np.flatnonzero(opposite.members == view.hit[k])[0])
+                cosine = float(row.normal(side)[k] @ opposite.normal(0)[j])
+                if abs(cosine) < 0.82:
+                    continue  # the view ends at a flank
+                facing[k] = True
+                table = pairs.setdefault((min(r, other), max(r, other)), np.zeros((2, 2)))
+                faced, weight = int(cosine > 0.0), 0.5 * float(like[k])
+                cells = table if r < other else table.T
+                cells[side, faced] -= weight * SHARED
+                cells[1 - side, 1 - faced] += weight * UNUSED
+            unary[r, side] += ALONE * float((~facing & (view.clear > 9.0)).sum())
+            unary[r, side] += 0.3 * float((~facing & (view.clear <= 9.0)).sum())
+            unary[r, side] -= ON_ROAD * float(is_on_road(spaces, row, side, view, roads).sum())
+            # A wider view costs less than a narrow one, all else being equal.
+            unary[r, side] += 0.25 * float((1.0 - like).sum()) - 0.01 * float(
+                np.minimum(view.clear, 8.0).sum()
+            )
+    label = component_labels(np.array(list(pairs), dtype=np.int64), n) if n else np.empty(0, np.int64)
+    sides, sure = np.zeros(n, dtype=int), np.ones(n)
+    for part in np.unique(label):
+        members = np.flatnonzero(label == part)
+        inside = {pair: table for pair, table in pairs.items() if label[pair[0]] == part}
+        sides[members] = _least_cost(unary[members], members, inside)
+        for r in members.tolist():
+            cost = unary[r].copy()
+            for (a, b), table in inside.items():
+                if r == a:
+                    cost += table[:, sides[b]]
+                elif r == b:
+                    cost += table[sides[a], :]
+            if np.isfinite(cost).all():
+                sure[r] = min(1.0, max(0.0, cost[1 - sides[r]] - cost[sides[r]]) / (0.6 * len(parts[r][0])))
+    return sides.tolist(), sure.tolist()
+
+
+def _least_cost(unary: FloatArray, members: IntArray, pairs: dict[tuple[int, int], FloatArray]) -> IntArray:
+    """Return the sides of least total cost: all combinations for few rows, otherwise by changes of one or two rows."""
+    where = {int(r): i for i, r in enumerate(members)}
+    tables = [(where[a], where[b], table) for (a, b), table in pairs.items()]
+    free = np.flatnonzero(np.isfinite(unary).all(axis=1))
+    fixed = np.argmin(unary, axis=1)
+
+    def total(sides: IntArray) -> FloatArray:
+        cost = np.asarray(unary[np.arange(len(unary)), sides].sum(axis=-1))
+        for a, b, table in tables:
+            cost = cost + table[sides[..., a], sides[..., b]]
+        return cost
+
+    if not len(free):
+        return np.asarray(fixed)
+    if len(free) <= EXHAUSTIVE:
+        sides = np.tile(fixed, (2 ** len(free), 1))
+        sides[:, free] = np.array(list(product((0, 1), repeat=len(free))), dtype=int).reshape(-1, len(free))
+        return np.asarray(sides[int(np.argmin(total(sides)))])
+    best, best_cost = fixed, np.inf
+    groups = [[i] for i in free.tolist()] + [[a, b] for a, b, _ in tables if a in free and b in free]
+    for value in (None, 0, 1):
+        sides = fixed.copy()
+        if value is not None:
+            sides[free] = value
+        cost, changed = float(total(sides)), True
+        while changed:
+            changed = False
+            for group in groups:
+                for values in product((0, 1), repeat=len(group)):
+                    trial = sides.copy()
+                    trial[group] = values
+                    trial_cost = float(total(trial))
+                    if trial_cost < cost - 1e-9:
+                        sides, cost, changed = trial, trial_cost, True
+        if cost < best_cost:
+            best, best_cost = sides, cost
+    return np.asarray(best)
+
 
 HALF_WIDTH = 3.0  # distance, m, of the centre line from a row that no other row faces
 NARROW_HALF_WIDTH = 2.2  # the same for oblique and kerbside rows
@@ -100,14 +331,12 @@ def _faced(rows: Sequence[OpenRow], owner: IntArray, r: int) -> IntArray:
 def _depth(part: OpenRow, is_faced: NDArray[np.bool_]) -> FloatArray:
     """Return the distances, (k,) m, from the mouths of a row to its centre line."""
     clear = part.view.clear
-    usual = HALF_WIDTH if part.row.slant > np.radians(70.0) else NARROW_HALF_WIDTH
-    depth = np.minimum(clear / 2, usual)
+    depth = np.minimum(clear / 2, HALF_WIDTH if part.row.slant > np.radians(70.0) else NARROW_HALF_WIDTH)
     if is_faced.any():
         typical = float(np.median(clear[is_faced])) / 2
         depth = np.where(is_faced, clear / 2, np.minimum(typical, np.maximum(clear - 1.4, clear / 2)))
     if len(depth) > 4:
-        window = np.lib.stride_tricks.sliding_window_view(np.pad(depth, 2, mode="edge"), 5)
-        depth = np.asarray(np.median(window, axis=1))
+        depth = median_filter(depth, 5, mode="nearest")
     return np.minimum(depth, np.maximum(clear - 1.2, clear / 2))
 
 
@@ -116,27 +345,20 @@ def _continuations(
 ) -> set[tuple[int, int]]:
     ends = [(r, k) for r, part in enumerate(rows) for k in {0, len(part.row) - 1}]
     at = np.array([stops[r][k] for r, k in ends])
-    found = set()
+    pairs = set()
     for a, b in sorted(cKDTree(at).query_pairs(ACROSS_GAP)):
         (r, i), (q, j) = ends[a], ends[b]
         if r == q:
             continue
-        one, other = rows[r].row, rows[q].row
-        if one.normal(rows[r].side)[i] @ other.normal(rows[q].side)[j] < SAME_DIRECTION:
-            continue
+        normals = rows[r].row.normal(rows[r].side)[i], rows[q].row.normal(rows[q].side)[j]
         step = at[b] - at[a]
-        length = float(np.hypot(*step))
-        if length < 1e-6:
-            continue
-        off = max(
-            abs(float(step @ one.normal(rows[r].side)[i])), abs(float(step @ other.normal(rows[q].side)[j]))
-        )
-        if off > OFF_LINE:
+        off = max(abs(float(step @ normal)) for normal in normals)
+        if normals[0] @ normals[1] < SAME_DIRECTION or np.hypot(*step) < 1e-6 or off > OFF_LINE:
             continue
         way = shapely.LineString([at[a], at[b]]).buffer(CAR_HALF_WIDTH, cap_style="flat")
         if len(tree.query(way, predicate="intersects")) == 0:
-            found.add((min(r, q), max(r, q)))
-    return found
+            pairs.add((min(r, q), max(r, q)))
+    return pairs
 
 
 def _aisle(
@@ -148,7 +370,7 @@ def _aisle(
     clear = np.concatenate([rows[r].view.clear for r in members])
     facing = np.concatenate([faced[r] >= 0 for r in members])
     points = _centre_line(xy, along, pitch)
-    width = float(np.median(clear[facing])) if facing.any() else float(np.median(clear))
+    width = float(np.median(clear[facing] if facing.any() else clear))
     ways = [_slant_direction(rows[r], points, stops[r]) for r in members]
     weight = sum(way * len(rows[r].row) for r, way in zip(members, ways, strict=True))
     agreed = all(way >= 0 for way in ways) or all(way <= 0 for way in ways)
@@ -165,8 +387,7 @@ def _slant_direction(part: OpenRow, points: FloatArray, stops: FloatArray) -> in
         shapely.get_coordinates(shapely.line_interpolate_point(line, np.clip(station + d, 0.0, line.length)))
         for d in (0.5, -0.5)
     )
-    nose = -part.row.outward(part.side)
-    return int(np.sign(np.median(((ahead - behind) * nose).sum(axis=1))))
+    return int(np.sign(np.median(((ahead - behind) * (-part.row.outward(part.side))).sum(axis=1))))
 
 
 def _centre_line(xy: FloatArray, along: FloatArray, pitch: FloatArray) -> FloatArray:
@@ -192,8 +413,7 @@ def _centre_line(xy: FloatArray, along: FloatArray, pitch: FloatArray) -> FloatA
 
 def _curve(xy: FloatArray, half: float) -> FloatArray:
     """Return a curve through scattered points: the longest path in their minimum spanning tree, smoothed."""
-    near = [np.flatnonzero(mask) for mask in _groups(xy, 1.6)]
-    nodes = np.array([xy[group].mean(axis=0) for group in near])
+    nodes = np.array([xy[group].mean(axis=0) for group in _groups(xy, 1.6)])
     if len(nodes) < 3:
         far = np.unravel_index(
             np.argmax(np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))), (len(xy),) * 2
@@ -203,20 +423,14 @@ def _curve(xy: FloatArray, half: float) -> FloatArray:
             line = line + np.array([[-half, 0.0], [half, 0.0]])
         return _lengthened(line, half)
     distance = np.hypot(*(nodes[:, None] - nodes[None]).transpose(2, 0, 1))
-    tree = minimum_spanning_tree(distance)
-    reach = dijkstra(tree, directed=False)
+    reach, before = dijkstra(minimum_spanning_tree(distance), directed=False, return_predecessors=True)
     start, end = (int(i) for i in np.unravel_index(int(np.argmax(reach)), reach.shape))
-    _, before = dijkstra(tree, directed=False, return_predecessors=True)
-    before = before[start]
     path = [end]
     while path[-1] != start:
-        path.append(int(before[path[-1]]))
+        path.append(int(before[start, path[-1]]))
     line = nodes[path]
-    if len(line) > 4:
-        inner = (line[:-2] + line[1:-1] + line[2:]) / 3
-        line = np.concatenate([line[:1], inner, line[-1:]])
-        inner = (line[:-2] + line[1:-1] + line[2:]) / 3
-        line = np.concatenate([line[:1], inner, line[-1:]])
+    for _ in range(2 if len(line) > 4 else 0):
+        line = np.concatenate([line[:1], (line[:-2] + line[1:-1] + line[2:]) / 3, line[-1:]])
     line = shapely.get_coordinates(shapely.simplify(shapely.LineString(line), SMOOTH))
     return _lengthened(line, half)
 
@@ -225,10 +439,8 @@ def _groups(xy: FloatArray, reach: float) -> list[NDArray[np.bool_]]:
     left = np.ones(len(xy), dtype=bool)
     groups = []
     while left.any():
-        first = xy[np.flatnonzero(left)[0]]
-        near = left & (np.hypot(*(xy - first).T) <= reach)
-        groups.append(near)
-        left &= ~near
+        groups.append(left & (np.hypot(*(xy - xy[left.argmax()]).T) <= reach))
+        left &= ~groups[-1]
     return groups
 
 
@@ -240,10 +452,8 @@ def _lengthened(line: FloatArray, by: float) -> FloatArray:
 
 
 def _centred(points: FloatArray, tree: shapely.STRtree) -> FloatArray:
-    """Move a line to the middle between the obstacles on its two sides."""
     line = shapely.LineString(points)
-    count = max(int(line.length / 1.5), 1) + 1
-    station = np.linspace(0.0, line.length, count)
+    station = np.linspace(0.0, line.length, max(int(line.length / 1.5), 1) + 1)
     xy = shapely.get_coordinates(shapely.line_interpolate_point(line, station))
     if len(xy) < 4:
         return points
@@ -251,8 +461,7 @@ def _centred(points: FloatArray, tree: shapely.STRtree) -> FloatArray:
     left = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.hypot(step[:, 0], step[:, 1])[:, None]
     room = np.stack([_distances(xy, sign * left, RECENTRED, tree) for sign in (1.0, -1.0)])
     # The nearest obstacle within half a car's length counts.
-    window = np.lib.stride_tricks.sliding_window_view(np.pad(room, ((0, 0), (2, 2)), mode="edge"), 5, axis=1)
-    room = window.min(axis=2)
+    room = minimum_filter1d(room, 5, axis=1, mode="nearest")
     between = (room < RECENTRED).all(axis=0)
     shift = np.where(between, (room[0] - room[1]) / 2, 0.0)
     window = np.lib.stride_tricks.sliding_window_view(np.pad(shift, 2, mode="edge"), 5)
@@ -319,6 +528,5 @@ def _free_length(start: FloatArray, way: FloatArray, most: float, tree: shapely.
     hits = tree.query(corridor, predicate="intersects")
     if not len(hits):
         return most
-    near = shapely.intersection(tree.geometries[hits], corridor)
-    corners = shapely.get_coordinates(near) - start
+    corners = shapely.get_coordinates(shapely.intersection(tree.geometries[hits], corridor)) - start
     return float(np.clip((corners @ way).min() - AHEAD, 0.0, most))

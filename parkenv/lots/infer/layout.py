@@ -10,8 +10,6 @@
 Roads of the map are lanes as they are: rows that they reach need no aisle.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -22,25 +20,26 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, QualityIssue
-from parkenv.lots.generators import Slots
-from parkenv.lots.infer.aisles import Aisle, find_aisles
-from parkenv.lots.infer.connections import Connection, FreeSpace, connect
+from parkenv.lots.generators import Slots, nearest_on_lanes
+from parkenv.lots.infer.aisles import Aisle, OpenRow, View, find_aisles, least_aisle, open_rows
 from parkenv.lots.infer.network import (
+    BEYOND_ENTRY,
+    Connection,
     Entry,
+    FreeSpace,
     Line,
+    connect,
+    corner_near,
     directed,
     entries_from_streets,
-    goal_beyond,
     guess_entry,
-    lanes_of,
     largest_part,
+    limit_junctions,
     noded,
     without_stubs,
 )
-from parkenv.lots.infer.openings import OpenRow, View, least_aisle, open_rows
 from parkenv.lots.infer.spaces import Spaces, find_rows
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Lane, Mouth
 
@@ -55,8 +54,6 @@ KERB_WIDTH = 2.0
 
 @dataclass(frozen=True, eq=False)
 class InferredLot:
-    """Everything inferred from outlines."""
-
     index: IntArray  # (n,) which spaces became slots
     slots: Slots
     lanes: tuple[Lane, ...]
@@ -77,11 +74,7 @@ def infer_lot(
     roads: Sequence[Line] = (),
     entries: FloatArray | None = None,
 ) -> InferredLot:
-    """Infer the lanes and the entry of a car park from its spaces.
-
-    Obstacles are buildings and other polygons, m, that no car drives over; `roads` are those of the map, service roads
-    and public streets (source `STREET`); `entries`, (k, 2) m, are those that are known.
-    """
+    """Infer a car park's lanes and entry from its spaces, beside `roads` of the map and known entries, (k, 2) m."""
     blocked = [*spaces.boxes(), *obstacles]
     rows, lost = open_rows(spaces, find_rows(spaces), obstacles, [road.points for road in roads])
     left_out = {"spaces that only another space leads to": lost.tolist()}
@@ -115,16 +108,19 @@ def infer_lot(
             entry = guess_entry(lines, mouths, blocked)
             lines = noded([*lines, Line(entry.points)])
             entries = entry.points[1:]
-    served, clear = _is_served(slots, lines), _is_clear(slots, lines)
+    served, clear = _is_served(slots, lines), np.ones(len(slots), dtype=bool)
+    ways = shapely.STRtree([shapely.LineString(line.points) for line in lines])
+    clear[ways.query(slots.boxes(shrink=0.2), predicate="dwithin", distance=CAR_ROOM)[0]] = False
     left_out["spaces that no aisle passes in front"] = index[~served].tolist()
     left_out["spaces beside which the only way is too narrow"] = index[served & ~clear].tolist()
     served &= clear
+    way = entries[0] - (corner_near(entries[0], lines) if entry is None else entry.points[0])
     return InferredLot(
         index=index[served],
         slots=slots[served],
-        lanes=tuple(lanes_of(lines)),
+        lanes=tuple(limit_junctions([Lane(line.points, line.one_way) for line in lines])),
         entries=entries,
-        goal=goal_beyond(entries[0], _lane_before(entry, entries[0], lines)),
+        goal=(entries[0] + BEYOND_ENTRY * (way / np.hypot(*way)))[None],
         rows=tuple(rows),
         aisles=tuple(aisles),
         connections=tuple(connections),
@@ -139,29 +135,19 @@ def _large_enough(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[list[OpenRow
     kept: list[OpenRow] = []
     small: dict[str, list[int]] = {}
     for part in rows:
-        members = part.row.members
-        if part.row.kerbside:
-            fits, reason = (
-                spaces.length[members] >= KERB_LENGTH,
-                f"kerbside spaces shorter than {KERB_LENGTH:g} m",
-            )
-        else:
-            fits, reason = spaces.width[members] >= NARROWEST, f"spaces narrower than {NARROWEST:g} m"
+        members, kerbside = part.row.members, part.row.kerbside
+        fits = spaces.length[members] >= KERB_LENGTH if kerbside else spaces.width[members] >= NARROWEST
+        reason = (
+            f"kerbside spaces shorter than {KERB_LENGTH:g} m"
+            if kerbside
+            else f"spaces narrower than {NARROWEST:g} m"
+        )
         small.setdefault(reason, []).extend(members[~fits].tolist())
         if fits.any():
             index = np.flatnonzero(fits)
             view = View(part.view.clear[index], part.view.hit[index])
             kept.append(OpenRow(part.row.part(index), part.side, view, part.certainty))
     return kept, small
-
-
-def _lane_before(entry: Entry | None, xy: FloatArray, lines: Sequence[Line]) -> FloatArray:
-    """Return a point, (2,) m, of the network that cars come by from the entry."""
-    if entry is not None:
-        return np.asarray(entry.points[0])
-    corners = np.concatenate([line.points for line in lines])
-    away = np.hypot(*(corners - xy).T)
-    return np.asarray(corners[int(np.argmin(np.where(away > 1.0, away, np.inf)))])
 
 
 def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
@@ -173,35 +159,20 @@ def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
     return np.asarray((ahead >= FACING * distance) & (distance <= SLOT_REACH - 0.05))
 
 
-def _is_clear(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
-    tree = shapely.STRtree([shapely.LineString(line.points) for line in lines])
-    hit = tree.query(slots.boxes(shrink=0.2), predicate="dwithin", distance=CAR_ROOM)[0]
-    clear = np.ones(len(slots), dtype=bool)
-    clear[hit] = False
-    return clear
-
-
 def _slots(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[IntArray, Slots, int]:
-    """Return the indices of the spaces in rows, their slots, and how many are wider than their outlines."""
     parts, members, widened = [], [], 0
     for part in rows:
-        row, side = part.row, part.side
-        outward = row.outward(side)
-        index = row.members
+        row, index, outward = part.row, part.row.members, part.row.outward(part.side)
         wider = np.maximum(KERB_WIDTH - spaces.width[index], 0.0) * row.kerbside
-        if row.kerbside:
-            # The lane is on the left of a car that keeps to the right.
-            heading = np.stack([outward[:, 1], -outward[:, 0]], axis=1)
-            mouth = Mouth.LEFT
-        else:
-            heading, mouth = -outward, Mouth.REAR
+        # The lane is on the left of a car that keeps to the right.
+        heading = np.stack([outward[:, 1], -outward[:, 0]], axis=1) if row.kerbside else -outward
         parts.append(
             Slots(
                 xy=spaces.xy[index] + wider[:, None] / 2 * outward,
                 yaw=np.arctan2(heading[:, 1], heading[:, 0]),
                 length=spaces.length[index],
                 width=spaces.width[index] + wider,
-                mouth=np.full(len(index), int(mouth), dtype=np.int8),
+                mouth=np.full(len(index), Mouth.LEFT if row.kerbside else Mouth.REAR, dtype=np.int8),
             )
         )
         members.append(index)
@@ -234,12 +205,14 @@ def draft_inferred_lot(
     without_aisle = {reason: [spaces.ids[i] for i in members] for reason, members in lot.left_out.items()}
     lost = sum(map(len, without_aisle.values()))
     if lost > MOST_LOST * len(spaces):
-        reasons = "; ".join(str(LeftOut(reason, tuple(ids))) for reason, ids in without_aisle.items())
+        reasons = "; ".join(map(str, LeftOut.by_reason(without_aisle)))
         raise InputError(f"{lost} of {len(spaces)} spaces have no aisle: {reasons}")
     if not len(goals) and options.guess_goal:
         goals, goal_note = lot.goal, "on the side of the entry"
     is_known = bool(options.entries) or options.guess_entry or lot.entry is None
     entries = lot.entries if is_known else lot.entries[:0]
+    unused = sum(map(len, left_out.values()))
+    guesses, issues = _guesses_and_issues(lot, len(spaces), unused, unit, options, goal_note)
     return LotDraft(
         name=name,
         slot_ids=tuple(spaces.ids[i] for i in lot.index),
@@ -251,9 +224,9 @@ def draft_inferred_lot(
         walls=tuple(walls),
         outlines=tuple(outlines),
         found=tuple(_found(lot, len(spaces), unit, frame)),
-        guesses=tuple(_guesses(lot, options, goal_note)),
-        issues=tuple(_issues(lot, len(spaces), sum(map(len, left_out.values())), unit, options)),
-        left_out=tuple(LeftOut(reason, tuple(ids)) for reason, ids in {**left_out, **without_aisle}.items()),
+        guesses=tuple(guesses),
+        issues=tuple(issues),
+        left_out=LeftOut.by_reason({**left_out, **without_aisle}),
         missing=tuple(_missing(lot, entries, goals)),
         frame=frame,
     ).searchable()
@@ -274,63 +247,55 @@ def _found(lot: InferredLot, n: int, unit: str, frame: LocalFrame | None) -> Ite
         yield f"frame: {frame}"
 
 
-def _guesses(lot: InferredLot, options: ImportOptions, goal_note: str) -> Iterator[str]:
+def _guesses_and_issues(
+    lot: InferredLot, n: int, unused: int, unit: str, options: ImportOptions, goal_note: str
+) -> tuple[list[str], list[QualityIssue]]:
+    """Return a sentence for each guess, and what may be wrong; `unused` spaces beside the n were not inferred from."""
     unsure = [part for part in lot.rows if part.certainty < SHARE_UNSURE]
-    yield (
-        f"open sides of rows ({len(lot.rows)}): where the ground in front is free and rows share aisles"
-        + (f"; {len(unsure)} could open to either side" if unsure else "")
-    )
-    if lot.aisles:
-        yield f"aisles along the rows' fronts: {len(lot.aisles)}"
-    if lot.connections:
-        far = max(shapely.LineString(c.points).length for c in lot.connections)
-        yield f"connections through free ground: {len(lot.connections)}, the longest {far:.0f} m"
-    narrow = sum(c.clearance < TWO_WAY_WIDTH / 2 - 0.05 for c in lot.connections)
-    if narrow:
-        yield f"connections narrower than {TWO_WAY_WIDTH:g} m, two-way nevertheless: {narrow}"
-    one_way = sum(aisle.one_way != 0 for aisle in lot.aisles) - len(lot.two_way)
-    if one_way:
-        yield f"aisles one-way by the slant of their spaces: {one_way}"
-    if lot.two_way:
-        yield f"aisles two-way against the slant of their spaces, as no other way leads back: {len(lot.two_way)}"
-    if lot.widened:
-        yield f"kerbside spaces narrower than {KERB_WIDTH:g} m, widened towards the lane: {lot.widened}"
-    if lot.entry is not None and not options.entries and options.guess_entry:
-        x, y = lot.entries[0].tolist()
-        yield f"entry at {x:.1f}, {y:.1f} m: {lot.entry.reason}"
-    if not options.goals and goal_note:
-        yield f"goal: {goal_note}"
+    either = f"; {len(unsure)} could open to either side" if unsure else ""
+    guesses = [
+        f"open sides of rows ({len(lot.rows)}): where the ground in front is free and rows share aisles{either}"
+    ]
+    issues: list[QualityIssue] = []
 
+    def note(count: float, guess: str = "", reason: str = "", error_probability: float = 0.0) -> None:
+        if count and guess:
+            guesses.append(guess)
+        if count and reason:
+            issues.append(QualityIssue(reason, error_probability))
 
-def _issues(
-    lot: InferredLot, n: int, unused: int, unit: str, options: ImportOptions
-) -> Iterator[QualityIssue]:
-    unsure = sum(
-        len(part.row) * (SHARE_UNSURE - part.certainty) / SHARE_UNSURE
-        for part in lot.rows
-        if part.certainty < SHARE_UNSURE
-    )
-    if unsure:
-        yield QualityIssue("rows could open to either side", min(0.6, 0.6 * float(unsure) / n + 0.02))
+    doubt = float(sum(len(p.row) * (SHARE_UNSURE - p.certainty) / SHARE_UNSURE for p in unsure))
+    note(doubt, "", "rows could open to either side", min(0.6, 0.6 * doubt / n + 0.02))
     lost = sum(map(len, lot.left_out.values())) + unused
-    if lost:
-        yield QualityIssue(f"{unit} left out", min(0.5, 1.5 * lost / (n + unused)))
+    note(lost, "", f"{unit} left out", min(0.5, 1.5 * lost / (n + unused)))
+    note(len(lot.aisles), f"aisles along the rows' fronts: {len(lot.aisles)}")
     reach = [shapely.LineString(c.points).length for c in lot.connections]
+    longest = max(reach, default=0.0)
+    note(len(reach), f"connections through free ground: {len(reach)}, the longest {longest:.0f} m")
     far = sum(length for length in reach if length > 40.0)
-    if far:
-        yield QualityIssue("long connections through unknown ground", min(0.4, 0.002 * far + 0.05))
+    note(far, "", "long connections through unknown ground", min(0.4, 0.002 * far + 0.05))
     narrow = sum(c.clearance < TWO_WAY_WIDTH / 2 - 0.05 for c in lot.connections)
-    if narrow:
-        yield QualityIssue("narrow connections", min(0.3, 0.05 * narrow))
-    if lot.two_way:
-        yield QualityIssue("oblique rows on two-way aisles", 0.15)
-    tight = sum(
-        len(part.row) for part in lot.rows if np.median(part.view.clear) < least_aisle(part.row) + 0.4
+    note(
+        narrow,
+        f"connections narrower than {TWO_WAY_WIDTH:g} m, two-way nevertheless: {narrow}",
+        "narrow connections",
+        min(0.3, 0.05 * narrow),
     )
-    if tight:
-        yield QualityIssue("narrow aisles", min(0.4, 0.5 * tight / n))
+    one_way = sum(aisle.one_way != 0 for aisle in lot.aisles) - len(lot.two_way)
+    note(one_way, f"aisles one-way by the slant of their spaces: {one_way}")
+    two_way = len(lot.two_way)
+    no_way = "aisles two-way against the slant of their spaces, as no other way leads back"
+    note(two_way, f"{no_way}: {two_way}", "oblique rows on two-way aisles", 0.15)
+    wider = f"kerbside spaces narrower than {KERB_WIDTH:g} m, widened towards the lane: {lot.widened}"
+    note(lot.widened, wider)
+    tight = sum(len(p.row) for p in lot.rows if np.median(p.view.clear) < least_aisle(p.row) + 0.4)
+    note(tight, "", "narrow aisles", min(0.4, 0.5 * tight / n))
     if lot.entry is not None and not options.entries:
-        yield QualityIssue("the entry is a guess", 0.05 + 0.1 * (1.0 - lot.entry.certainty))
+        x, y = lot.entries[0].tolist()
+        note(options.guess_entry, f"entry at {x:.1f}, {y:.1f} m: {lot.entry.reason}")
+        note(1, "", "the entry is a guess", 0.05 + 0.1 * (1.0 - lot.entry.certainty))
+    note(bool(goal_note) and not options.goals, f"goal: {goal_note}")
+    return guesses, issues
 
 
 def _missing(lot: InferredLot, entries: FloatArray, goals: FloatArray) -> Iterator[str]:

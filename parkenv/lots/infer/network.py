@@ -1,4 +1,4 @@
-"""The lanes of an inferred lot, their one-way directions, and its entry and goal where the map has none."""
+"""The lanes of an inferred lot: connections of aisles through free space, directions, and its entry and goal."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ import networkx as nx
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.world.drive_graph import NODE_TOLERANCE, node_labels
 from parkenv.world.lot import MOVES, Lane
 
@@ -91,8 +94,8 @@ def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
             nodes[n] = np.round(at / GRID) * GRID
             corners.setdefault(j, []).append(nodes[n])
     moved = [part.copy() for part in points]
-    for node, its_users in zip(nodes, users, strict=True):
-        for k, end in its_users:
+    for node, ends_there in zip(nodes, users, strict=True):
+        for k, end in ends_there:
             moved[k][end] = node
     for j, more in corners.items():
         inner = np.concatenate([np.array(more), moved[j][1:-1]])
@@ -164,7 +167,6 @@ def directed(lines: Sequence[Line], wanted: dict[int, int]) -> tuple[list[Line],
 
 
 def largest_part(lines: Sequence[Line]) -> list[list[int]]:
-    """Return the connected parts of a network as indices of lines, the longest part first."""
     graph = nx.Graph()
     label = node_labels(np.concatenate([line.points[[0, -1]] for line in lines])).reshape(-1, 2)
     for k, (a, b) in enumerate(label.tolist()):
@@ -175,15 +177,10 @@ def largest_part(lines: Sequence[Line]) -> list[list[int]]:
     return sorted(parts, key=lambda part: (-sum(length[k] for k in part), part))
 
 
-def lanes_of(lines: Sequence[Line]) -> list[Lane]:
-    return limit_junctions([Lane(line.points, line.one_way) for line in lines])
-
-
 def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
     """Change lanes so that at most four lead away from every junction.
 
-    At junctions with more, a lane that ends there joins the neighbouring arm a few metres before the junction instead.
-    A junction at which too few lanes end stays unchanged.
+    Where there are more, one that ends there joins the next arm a few metres before, if enough lanes end there.
     """
     lines = [lane.points for lane in lanes]
     oneway = [lane.oneway for lane in lanes]
@@ -198,11 +195,6 @@ def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
     return [replace(lane, points=line) for lane, line in zip(lanes, lines, strict=True) if len(line) > 1]
 
 
-def _leaving(lines: Sequence[FloatArray], oneway: Sequence[bool], at: set[tuple[int, int]]) -> int:
-    forward = sum(i + 1 < len(lines[k]) for k, i in at)
-    return forward + sum(i > 0 and not oneway[k] for k, i in at)
-
-
 def _crowded_nodes(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> list[set[tuple[int, int]]]:
     pairs = [(k, i) for k, line in enumerate(lines) for i in range(len(line))]
     at: dict[int, set[tuple[int, int]]] = {}
@@ -211,17 +203,15 @@ def _crowded_nodes(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> list[
     return [
         users
         for users in at.values()
-        if _leaving(lines, oneway, users) > len(MOVES) and any(i in (0, len(lines[k]) - 1) for k, i in users)
+        if sum((i + 1 < len(lines[k])) + (i > 0 and not oneway[k]) for k, i in users) > len(MOVES)
+        and any(i in (0, len(lines[k]) - 1) for k, i in users)
     ]
 
 
 def _move_lane_end(
     lines: list[FloatArray], oneway: Sequence[bool], users: set[tuple[int, int]]
 ) -> tuple[int, ...]:
-    """Move the end of the lane closest to another arm onto that arm; return the two lanes, if there are any.
-
-    Both lead away from the junction, and a two-way lane does not join a one-way arm: cars would not come back by it.
-    """
+    """Move the end of the lane closest to another arm onto it, but two-way ones onto no one-way arm; return both."""
     arms = []  # lane, point, neighbouring point
     for k, i in sorted(users):
         arms += [(k, i, j) for j in (i - 1, i + 1) if 0 <= j < len(lines[k]) and (j > i or not oneway[k])]
@@ -279,10 +269,9 @@ def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[
 def entries_from_streets(
     lines: Sequence[Line], mouths: FloatArray
 ) -> tuple[list[Line], FloatArray, Entry] | None:
-    """Return the lanes, the entries, (k, 2) m, and a description of the first where the map has public streets.
+    """Return the lanes, the entries, (k, 2) m, and the first one's description, if there are public streets.
 
-    Cars enter where lanes meet a street. A street remains a lane if spaces open to it or only it connects other lanes;
-    then cars enter where it leaves the map.
+    They stay lanes if spaces open to them or only they connect others; then cars enter where they leave the map.
     """
     is_street = np.array([line.source == STREET for line in lines])
     if not is_street.any():
@@ -302,10 +291,14 @@ def entries_from_streets(
     entries = np.array([ends[np.flatnonzero(label.ravel() == node)[0]] for node in nodes]).reshape(-1, 2)
     if not len(entries):
         return None
-    corners = np.concatenate([line.points for line in kept])
-    away = np.hypot(*(corners - entries[0]).T)
-    before = corners[int(np.argmin(np.where(away > 1.0, away, np.inf)))]
-    return kept, entries, Entry(np.stack([before, entries[0]]), reason, 1.0)
+    return kept, entries, Entry(np.stack([corner_near(entries[0], kept), entries[0]]), reason, 1.0)
+
+
+def corner_near(xy: FloatArray, lines: Sequence[Line]) -> FloatArray:
+    """Return the corner of lines nearest to a point, (2,) m each, but for those within 1 m."""
+    corners = np.concatenate([line.points for line in lines])
+    away = np.hypot(*(corners - xy).T)
+    return np.asarray(corners[int(np.argmin(np.where(away > 1.0, away, np.inf)))])
 
 
 def _outermost(lines: Sequence[Line]) -> Entry:
@@ -319,14 +312,6 @@ def _outermost(lines: Sequence[Line]) -> Entry:
     return Entry(np.array([before, ends[k]]), "the outermost end of a lane: no free way leads out", 0.0)
 
 
-def _outline(shapes: shapely.Geometry) -> shapely.Geometry:
-    """Return the concave hull; the convex one where GEOS cannot triangulate, as with many corners on one line."""
-    try:
-        return shapely.concave_hull(shapes, ratio=0.3)
-    except shapely.errors.GEOSException:
-        return shapely.convex_hull(shapes)
-
-
 def _best_way_out(
     lines: Sequence[Line],
     spaces_xy: FloatArray,
@@ -335,9 +320,11 @@ def _best_way_out(
     longest: float,
 ) -> Entry | None:
     tree = shapely.STRtree(list(blocked))
-    ground = _outline(
-        shapely.union_all([*blocked, *(shapely.LineString(line.points).buffer(2.0) for line in lines)])
-    )
+    whole = shapely.union_all([*blocked, *(shapely.LineString(line.points).buffer(2.0) for line in lines)])
+    try:
+        ground = shapely.concave_hull(whole, ratio=0.3)
+    except shapely.errors.GEOSException:  # it cannot triangulate, as with many corners on one line
+        ground = shapely.convex_hull(whole)
     shapely.prepare(ground)
     ends = np.concatenate([line.points[[0, -1]] for line in lines])
     label = node_labels(ends)
@@ -345,41 +332,34 @@ def _best_way_out(
     graph = nx.Graph()
     for (a, b), line in zip(label.reshape(-1, 2).tolist(), lines, strict=True):
         graph.add_edge(a, b, weight=shapely.LineString(line.points).length)
-    nodes = np.array([at[k] for k in sorted(at)])
     names = sorted(at)
+    nodes = np.array([at[k] for k in names])
     nearest = shapely.STRtree(np.asarray(shapely.points(nodes))).nearest(
         np.asarray(shapely.points(spaces_xy))
     )
     weight = np.bincount(np.asarray(nearest), minlength=len(names))
-    found: list[tuple[float, float, float, FloatArray, bool]] = []
-    for number, name in enumerate(names):
-        ways = _ways_out(name, nodes[number], lines, label, graph)
+    guesses: list[tuple[float, float, float, FloatArray, bool]] = []
+    for name, xy in zip(names, nodes, strict=True):
+        ways = _ways_out(name, xy, lines, label, graph)
         if not ways:
             continue
         reach = nx.single_source_dijkstra_path_length(graph, name, weight="weight")
         drive = float(sum(weight[i] * reach.get(other, 1e3) for i, other in enumerate(names)) / weight.sum())
         for way, is_end in ways:
-            length = _length_out(nodes[number], way, ground, longest)
-            if length is None:
+            # A ray leaves the car park for good at the last point inside.
+            inside = shapely.intersection(shapely.LineString([xy, xy + 150.0 * way]), ground)
+            length = 0.0 if inside.is_empty else float(((shapely.get_coordinates(inside) - xy) @ way).max())
+            points = np.array([xy, xy + (length + WAY_OUT) * way])
+            road = shapely.LineString(points)
+            if length > longest or len(tree.query(road, predicate="dwithin", distance=corridor)):
                 continue
-            length += WAY_OUT
-            road = shapely.LineString([nodes[number], nodes[number] + length * way])
-            if len(tree.query(road, predicate="dwithin", distance=corridor)):
-                continue
-            score = drive + 2.0 * length - DEAD_END_GAIN * is_end
-            found.append(
-                (
-                    round(score, 3),
-                    *np.round(nodes[number], 3),
-                    np.array([nodes[number], nodes[number] + length * way]),
-                    is_end,
-                )
-            )
-    if not found:
+            score = drive + 2.0 * (length + WAY_OUT) - DEAD_END_GAIN * is_end
+            guesses.append((round(score, 3), *np.round(xy, 3), points, is_end))
+    if not guesses:
         return None
-    found.sort(key=lambda guess: guess[:3])
-    score, *_, points, is_end = found[0]
-    others = [guess[0] for guess in found[1:] if np.hypot(*(guess[3][1] - points[1])) > 15.0]
+    guesses.sort(key=lambda guess: guess[:3])
+    score, *_, points, is_end = guesses[0]
+    others = [guess[0] for guess in guesses[1:] if np.hypot(*(guess[3][1] - points[1])) > 15.0]
     certainty = float(np.clip((others[0] - score) / 30.0, 0.0, 1.0)) if others else 1.0
     where = "an aisle's free end at the edge" if is_end else "a free way from a lane to the edge"
     return Entry(points, f"{where}, with the shortest drives to the spaces", certainty)
@@ -411,17 +391,208 @@ def _ways_out(
     return ways
 
 
-def _length_out(xy: FloatArray, way: FloatArray, ground: shapely.Geometry, longest: float) -> float | None:
-    """Return the distance, m, from a point to where a ray leaves the car park for good; None if that is too far."""
-    ray = shapely.LineString([xy, xy + 150.0 * way])
-    inside = shapely.intersection(ray, ground)
-    if inside.is_empty:
-        return 0.0
-    far = float(((shapely.get_coordinates(inside) - xy) @ way).max())
-    return far if far <= longest else None
+WIDE, DETOUR_WIDE, DETOUR_ENDS, DETOUR_MIDWAY = 2.2, 1.8, 2.2, 4.0
+"""Clearance, m, of a wide connection, and the longest drive between the ends of a possible connection without it, as a
+multiple of its length: of a wide one, of one between ends of aisles, and of any other."""
+SAMPLE = 1.0  # spacing, m, of the points of an aisle from which connections may start
+NEAR_END = 6.0  # distance, m, from the end of an aisle within which a connection starts at the end
+SHORTEST = 0.3  # m
 
 
-def goal_beyond(entry: FloatArray, before: FloatArray) -> FloatArray:
-    """Return a goal, (1, 2) m, beyond an entry, as seen from the lane point before it."""
-    way = (entry - before) / np.hypot(*(entry - before))
-    return np.asarray((entry + BEYOND_ENTRY * way)[None])
+@dataclass(frozen=True, eq=False)
+class Connection:
+    points: FloatArray  # (k, 2) m
+    ends: tuple[int, int]  # indices of the aisles
+    clearance: float  # m, distance to the nearest obstacle
+
+
+def connect(lines: Sequence[FloatArray], space: FreeSpace, longest: float) -> list[Connection]:
+    """Connect centre lines, (k, 2) m each, that share no point, by ways up to `longest` m."""
+    stations, xy, owner = _samples(lines)
+    cells = space.cells(xy)
+    distance, before, source, pairs = space.spread(np.unique(cells))
+    at_cell: dict[int, int] = {}
+    # Ends of lines come first.
+    is_end = np.r_[True, owner[1:] != owner[:-1]] | np.r_[owner[1:] != owner[:-1], True]
+    for i in np.lexsort((stations, owner, ~is_end)).tolist():
+        at_cell.setdefault(int(cells[i]), i)
+    graph = _road_graph(lines, stations, xy, owner)
+    length = [shapely.LineString(line).length for line in lines]
+
+    def kind(i: int) -> int:
+        line, station = int(owner[i]), stations[i]
+        if station <= min(NEAR_END, length[line] / 2):
+            return 0
+        return 1 if station >= length[line] - NEAR_END else 2
+
+    best: dict[tuple[int, int, int, int], tuple[float, int, int]] = {}
+    one, other = source[pairs[:, 0]], source[pairs[:, 1]]
+    gap = np.hypot(*(space.centers(pairs[:, 0]) - space.centers(pairs[:, 1])).T)
+    cost = distance[pairs[:, 0]] + distance[pairs[:, 1]] + gap
+    for c, p, q, a, b in zip(
+        cost.tolist(), pairs[:, 0].tolist(), pairs[:, 1].tolist(), one.tolist(), other.tolist(), strict=True
+    ):
+        i, j = at_cell[a], at_cell[b]
+        if owner[i] == owner[j] and abs(stations[i] - stations[j]) < 20.0:
+            continue
+        if owner[i] > owner[j]:
+            i, j, p, q = j, i, q, p
+        key = (int(owner[i]), kind(i), int(owner[j]), kind(j))
+        if c < best.get(key, (np.inf,))[0]:
+            best[key] = (c, p, q)
+
+    found: list[Connection] = []
+    for c, p, q in sorted(best.values()):
+        i, j = (at_cell[int(source[cell])] for cell in (p, q))
+        if c > longest:
+            break
+        try:
+            known = nx.dijkstra_path_length(graph, i, j)
+        except nx.NetworkXNoPath:
+            known = np.inf
+        if known <= DETOUR_WIDE * max(c, SHORTEST):
+            continue
+        path = np.concatenate([_trace(space, before, p)[::-1], _trace(space, before, q)])
+        path = np.concatenate([[xy[i]], path[1:-1], [xy[j]]])
+        room = float(space.clearance.ravel()[space.cells(path)].min())
+        detour = DETOUR_ENDS if kind(i) < 2 and kind(j) < 2 else DETOUR_MIDWAY
+        if known <= (DETOUR_WIDE if room >= WIDE else detour) * max(c, SHORTEST):
+            continue
+        points = space.pulled_straight(path)
+        points = points[np.r_[True, np.hypot(*np.diff(points, axis=0).T) > 0.05]]
+        graph.add_edge(i, j, weight=c)
+        if len(points) > 1:
+            found.append(Connection(points, (int(owner[i]), int(owner[j])), space.room(points)))
+    return found
+
+
+def _samples(lines: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return points every metre along lines, ends included: stations, (n,) m, points, (n, 2) m, and lines, (n,)."""
+    stations, xy, owner = [], [], []
+    for k, points in enumerate(lines):
+        line = shapely.LineString(points)
+        count = max(2, int(np.ceil(line.length / SAMPLE)) + 1)
+        at = np.linspace(0.0, line.length, count)
+        stations.append(at)
+        xy.append(shapely.get_coordinates(shapely.line_interpolate_point(line, at)))
+        owner.append(np.full(count, k))
+    return np.concatenate(stations), np.concatenate(xy), np.concatenate(owner)
+
+
+def _road_graph(
+    lines: Sequence[FloatArray], stations: FloatArray, xy: FloatArray, owner: IntArray
+) -> nx.Graph:
+    graph = nx.Graph()
+    graph.add_nodes_from(range(len(xy)))
+    along = owner[1:] == owner[:-1]
+    for i in np.flatnonzero(along).tolist():
+        graph.add_edge(i, i + 1, weight=float(stations[i + 1] - stations[i]))
+    shapes = np.array([shapely.LineString(points) for points in lines])
+    one, other = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=0.05)
+    first = np.searchsorted(owner, np.arange(len(lines)))
+    for a, b in zip(one[one < other].tolist(), other[one < other].tolist(), strict=True):
+        meeting = shapely.get_coordinates(shapely.shortest_line(shapes[a], shapes[b]))[0]
+        i, j = (int(first[k] + np.argmin(np.hypot(*(xy[owner == k] - meeting).T))) for k in (a, b))
+        graph.add_edge(i, j, weight=0.1)
+    return graph
+
+
+def _trace(space: FreeSpace, before: IntArray, cell: int) -> FloatArray:
+    cells = [cell]
+    while before[cells[-1]] >= 0:
+        cells.append(int(before[cells[-1]]))
+    return space.centers(np.array(cells))
+
+
+LEAST_CLEARANCE = 1.4  # half the width of a one-way road, m
+COMFORTABLE = 2.9  # clearance, m, from which more is worth nothing
+MARGIN = 14.0  # m around the obstacles
+FINE, COARSE, FINE_CELLS = 0.7, 1.0, 250_000
+"""Sizes of cells, m, and the number of fine cells above which they are coarse."""
+
+
+class FreeSpace:
+    """A grid over the surroundings of obstacles, polygons, m, that no car drives over."""
+
+    def __init__(self, obstacles: Sequence[shapely.Geometry]) -> None:
+        whole = shapely.union_all(list(obstacles))
+        x0, y0, x1, y1 = whole.bounds
+        area = (x1 - x0 + 2 * MARGIN) * (y1 - y0 + 2 * MARGIN)
+        self.cell = FINE if area / FINE**2 <= FINE_CELLS else max(COARSE, (area / FINE_CELLS) ** 0.5)
+        self.low = np.array([x0, y0]) - MARGIN
+        nx, ny = np.ceil((np.array([x1, y1]) + MARGIN - self.low) / self.cell).astype(int)
+        self.shape = (int(nx), int(ny))
+        self.xy = (
+            self.low
+            + (np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), -1) + 0.5) * self.cell
+        )
+        shapely.prepare(whole)
+        covered = shapely.contains_xy(whole, self.xy[..., 0].ravel(), self.xy[..., 1].ravel()).reshape(
+            self.shape
+        )
+        self.clearance = np.asarray(distance_transform_edt(~covered)) * self.cell - 0.5 * self.cell
+        self._whole = whole
+        self._boundary = shapely.STRtree(shapely.get_parts(whole))
+
+    def cells(self, xy: FloatArray) -> IntArray:
+        """Return the flat index of the cell of each point, (n, 2) m."""
+        index = np.clip(((xy - self.low) / self.cell).astype(int), 0, np.array(self.shape) - 1)
+        return np.asarray(np.ravel_multi_index((index[:, 0], index[:, 1]), self.shape))
+
+    def centers(self, cells: IntArray) -> FloatArray:
+        return self.xy.reshape(-1, 2)[cells]
+
+    def spread(self, start: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray]:
+        """Drive from cells to all others at once.
+
+        Returns the cost, (n_cells,) m, predecessor and start of each cell, and neighbours, (m, 2), of different starts.
+        """
+        flat = self.clearance.ravel()
+        price = 1.0 + 1.5 * np.clip((COMFORTABLE - flat) / (COMFORTABLE - LEAST_CLEARANCE), 0.0, 1.0)
+        passable = flat >= LEAST_CLEARANCE - 0.35 * self.cell
+        passable[start] = True
+        number = np.arange(flat.size).reshape(self.shape)
+        tails, heads, costs = [], [], []
+        for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            a = number[: self.shape[0] - dx, max(0, -dy) : self.shape[1] - max(0, dy)].ravel()
+            b = number[dx:, max(0, dy) : self.shape[1] - max(0, -dy)].ravel()
+            both = passable[a] & passable[b]
+            a, b = a[both], b[both]
+            tails.append(a)
+            heads.append(b)
+            costs.append((price[a] + price[b]) / 2 * float(np.hypot(dx, dy)) * self.cell)
+        tail, head, cost = map(np.concatenate, (tails, heads, costs))
+        graph = coo_array((cost, (tail, head)), shape=(flat.size,) * 2).tocsr()
+        distance, before, source = dijkstra(
+            graph, directed=False, indices=start, min_only=True, return_predecessors=True
+        )
+        apart = (source[tail] != source[head]) & np.isfinite(distance[tail]) & np.isfinite(distance[head])
+        pairs = np.stack([tail[apart], head[apart]], axis=1).astype(np.int64)
+        return np.asarray(distance), before.astype(np.int64), source.astype(np.int64), pairs
+
+    def is_clear(self, points: FloatArray, clearance: float) -> bool:
+        line = shapely.LineString(points)
+        return len(self._boundary.query(line, predicate="dwithin", distance=clearance)) == 0
+
+    def room(self, points: FloatArray) -> float:
+        return float(shapely.distance(shapely.LineString(points), self._whole))
+
+    def pulled_straight(self, path: FloatArray) -> FloatArray:
+        """Return a path with as few corners as its clearance allows, (k, 2) m."""
+        wide = self.clearance.ravel()[self.cells(path)]
+        kept, at = [0], 0
+        while at < len(path) - 1:
+            ahead = len(path) - 1
+            while ahead > at + 1:
+                least = float(
+                    np.clip(
+                        wide[at : ahead + 1].min() - 0.6 * self.cell, LEAST_CLEARANCE - 0.1, COMFORTABLE - 0.3
+                    )
+                )
+                if self.is_clear(path[[at, ahead]], least):
+                    break
+                ahead -= max(1, (ahead - at) // 12)
+            ahead = max(ahead, at + 1)
+            kept.append(ahead)
+            at = ahead
+        return path[kept]

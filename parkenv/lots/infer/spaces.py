@@ -34,8 +34,7 @@ STRAIGHTENED = 0.2  # tolerance, m, for further corners on the sides of an outli
 class Spaces:
     """The rectangles of n parking spaces, m in the lot's frame.
 
-    `axis` points along the longer side; its sign means nothing. `opens` points to the open side where that is known:
-    unit vectors decide it, shorter ones are a preference, zeros say nothing.
+    `opens` are unit vectors to known open sides, shorter ones preferences, zeros nothing.
     """
 
     ids: tuple[str, ...]
@@ -70,11 +69,7 @@ class Spaces:
 
 
 def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> Spaces:
-    """Return the spaces of outlines, (n,) valid polygons, m.
-
-    A parallelogram becomes the rectangle along its longer sides, any other outline the smallest rectangle around it,
-    narrowed to the outline's area. Rectangles that overlap a little are narrowed until they do not.
-    """
+    """Return the spaces of outlines, (n,) valid polygons, m: rectangles of their area, narrowed until none overlap."""
     area = shapely.area(outlines)
     validate_areas(ids, area)
     corners = np.stack([rectangle_corners(outline) for outline in outlines])
@@ -179,8 +174,7 @@ class Row:
     def normal(self, side: int) -> FloatArray:
         """Unit vectors, (k, 2), across the row toward a side."""
         left = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
-        sign = np.sign((left * self.out).sum(axis=1)) * (1.0 - 2.0 * side)
-        return np.asarray(left * sign[:, None])
+        return np.asarray(left * (np.sign((left * self.out).sum(axis=1)) * (1.0 - 2.0 * side))[:, None])
 
     def outward(self, side: int) -> FloatArray:
         """Unit vectors, (k, 2), from the centres to the mouths of a side."""
@@ -199,7 +193,6 @@ class Row:
 
 
 def find_rows(spaces: Spaces) -> list[Row]:
-    """Return the rows; every space is in exactly one, a single space in a row of its own."""
     boxes = spaces.boxes()
     one, other = shapely.STRtree(boxes).query(boxes, predicate="dwithin", distance=TOUCHING)
     pair = one != other
@@ -353,8 +346,8 @@ class CenterRow:
 
 def spaces_from_centers(
     ids: Sequence[str], xy: FloatArray, yaw: FloatArray | None
-) -> tuple[Spaces, IntArray, list[CenterRow]]:
-    """Return rectangles of the centres in rows, their indices, and the rows; `yaw`, (n,) rad, is of cars nose-in."""
+) -> tuple[Spaces, IntArray]:
+    """Return rectangles of the centres, (n, 2) m, in rows, and their indices; `yaw`, (n,) rad, is of cars nose-in."""
     rows, strays = _find_rows(xy)
     if len(strays) > MOST_STRAYS * len(xy):
         shown = ", ".join(ids[i] for i in strays[:5])
@@ -378,14 +371,7 @@ def spaces_from_centers(
             opens[index] = 0.0 if nose is None else -nose
             length[index], width[index] = BAY_SIZE[0], row.extent(WIDEST_BAY) * np.sin(angle)
     kept = np.setdiff1d(np.arange(n), strays)
-    spaces = Spaces(tuple(ids), xy, axis, length, width, opens).subset(kept)
-    return without_overlaps(spaces), kept, rows
-
-
-def describe_rows(rows: Sequence[CenterRow]) -> str:
-    listed = ", ".join(str(len(row.members)) for row in rows[:12]) + (", ..." if len(rows) > 12 else "")
-    spacing = [row.spacing for row in rows]
-    return f"{len(rows)} rows of {listed} slots, a slot every {min(spacing):.2f} to {max(spacing):.2f} m"
+    return without_overlaps(Spaces(tuple(ids), xy, axis, length, width, opens).subset(kept)), kept
 
 
 def _find_rows(xy: FloatArray) -> tuple[list[CenterRow], IntArray]:
@@ -449,7 +435,6 @@ def _row(members: IntArray, xy: FloatArray) -> CenterRow:
 
 
 def _row_in_line(point: FloatArray, rows: Sequence[CenterRow], xy: FloatArray) -> int:
-    """Return the row that a point continues across a gap; -1 for none."""
     for k, row in enumerate(rows):
         away = point - xy[row.members]
         i = int(np.argmin(np.hypot(away[:, 0], away[:, 1])))

@@ -6,8 +6,8 @@ Slots come from:
 - `amenity=parking` areas without such spaces, filled by the rule of `fill_outline`;
 - kerbside parking tagged on streets, see `rows`.
 
-The import leaves out, and lists, spaces for disabled drivers (unless requested; they are subtracted from a tagged
-capacity), private and closed parking, parking underground or on a deck, and spaces for other vehicles.
+The import leaves out, and lists, spaces for disabled drivers (subtracted from a tagged capacity), private and closed
+parking, parking underground or on a deck, and spaces for other vehicles.
 
 Lanes come from `highway=service` ways. If slots open to a public street, or the service roads are not connected, the
 public streets within 60 m of the slots are lanes too. Roads that serve no slot and lead nowhere are dropped. A slot
@@ -18,8 +18,6 @@ map: at its edge, or otherwise at ends not tagged as dead ends. Goals are the bu
 slots, main entrances first, or the centre of the nearest building. Buildings block the view. Traffic keeps to the
 right, unless `in_left_hand_traffic` converts the draft.
 """
-
-from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -39,48 +37,49 @@ from parkenv.lots.infer.layout import draft_inferred_lot, infer_lot
 from parkenv.lots.infer.network import STREET, Line, limit_junctions
 from parkenv.lots.infer.spaces import rectangle_corners, spaces_from_outlines, to_rectangle, validate_areas
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.areas import (
+from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
+from parkenv.lots.osm.parking import (
+    ARRANGEMENTS,
     BUILDING_REACH,
+    CORRIDOR,
     ENTRANCE_REACH,
     Area,
+    Junctions,
     areas_of,
     exterior_rings,
+    fill_outline,
     find_goals,
+    is_blind_end,
     is_building,
+    is_crossing,
     is_parking_area,
     is_space,
+    kerb_of,
+    kerb_slots,
     slots_by_rank,
     split_space,
     split_walls,
     usable_spaces,
     within,
+    without_overlaps,
 )
-from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.roads import (
+    SIDES,
     Rank,
     Road,
     clipped_road,
     closed_to_cars,
     components_with_slots,
-    dead_ends,
     lanes_of,
     off_the_ground,
     open_ends,
     read_roads,
+    road_ends,
     road_of,
     street_junctions,
     turns_of,
     used_roads,
     whole_number,
-)
-from parkenv.lots.osm.rows import (
-    ARRANGEMENTS,
-    CORRIDOR,
-    Junctions,
-    fill_outline,
-    kerb_of,
-    kerb_slots,
-    without_overlaps,
 )
 from parkenv.world.drive_graph import SLOT_REACH, component_labels
 from parkenv.world.lot import Lane
@@ -101,30 +100,21 @@ def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraf
     place = read_map(path)
     with naming(path):
         draft = draft_of_map(place_name(path), place, options or ImportOptions(), place.positions.frame)
-    found = (
-        *([place.positions.found] if place.positions.found else []),
-        *draft.found,
-        *cut_elements(place.elements),
-    )
+    found = (*filter(None, [place.positions.found]), *draft.found, *place.cut_elements())
     return replace(draft, found=found, left_out=(*place.left_out, *draft.left_out))
-
-
-def cut_elements(elements: Sequence[OsmElement]) -> Iterator[str]:
-    if cut := tuple(e.id for e in elements if e.cut):
-        yield str(LeftOut("cut at the edge of the map", cut))
 
 
 def draft_of_map(
     name: str, place: OsmMap, options: ImportOptions, frame: LocalFrame | None = None
 ) -> LotDraft:
-    """Draft a lot from a map, in a frame or one around its parking; see `osm_draft`.
+    """Draft a lot from a map.
 
-    Without a road for cars among them, the lanes are inferred from the spaces' outlines; the same holds if guesses are
-    allowed and the roads do not reach all spaces or lack an entry.
+    Lanes are inferred from outlines of spaces where there are no roads, or, if guesses are allowed, too few of them.
     """
     elements = place.elements
     has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
-    if has_spaces and not any(_may_be_lane(e) for e in elements):
+    ways = (e for e in elements if not e.is_node)
+    if has_spaces and not any(isinstance(road_of(e.id, e.tags, e.lines[0] * 1e5), Road) for e in ways):
         return outline_draft(name, elements, [], frame or map_frame(elements), options)
     importer = _LotImport(name, place, options, frame)
     importer.read_spaces()
@@ -145,15 +135,7 @@ def map_frame(elements: Sequence[OsmElement]) -> LocalFrame:
     return LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
 
 
-def _may_be_lane(element: OsmElement) -> bool:
-    if element.is_node or "highway" not in element.tags:
-        return False
-    return isinstance(road_of(element.id, element.tags, element.lines[0] * 1e5), Road)
-
-
 class _Part(NamedTuple):
-    """A part of a drawn space for one car."""
-
     area: Area
     name: str
     polygon: shapely.Geometry
@@ -197,13 +179,8 @@ class MapImport:
         self.left_out[NO_AISLE] += [parts[i].name for i in np.flatnonzero(left).tolist()]
         return parts, by_rank
 
-    def all_left_out(self) -> list[LeftOut]:
-        return [LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items() if ids]
-
 
 class _Slot(NamedTuple):
-    """A slot of a lot: where it comes from, and the rank of the road that it opens to."""
-
     source: str
     owner: str  # id of its element
     id: str
@@ -211,8 +188,6 @@ class _Slot(NamedTuple):
 
 
 class _LotImport(MapImport):
-    """The state of an import of a lot: roads, areas and slots."""
-
     def __init__(self, name: str, place: OsmMap, options: ImportOptions, frame: LocalFrame | None) -> None:
         parking = [e for e in place.elements if _is_parking(e)]
         if not parking:
@@ -249,7 +224,7 @@ class _LotImport(MapImport):
     # ---- slots ----
 
     def read_spaces(self) -> None:
-        usable, unused = usable_spaces(self.spaces, self.outlines, with_disabled=self.options.with_disabled)
+        usable, unused = usable_spaces(self.spaces, self.outlines)
         for area, reason in unused:
             self.left_out[reason].append(area.element.id)
         self.blocked += [area.polygon for area in (*(area for area, _ in unused), *usable)]
@@ -275,7 +250,7 @@ class _LotImport(MapImport):
                 continue
             orientation = tags.get("orientation", tags.get("parking:orientation"))
             capacity = whole_number(tags.get("capacity"))
-            if capacity is not None and not self.options.with_disabled:
+            if capacity is not None:
                 capacity = max(capacity - (whole_number(tags.get("capacity:disabled")) or 0), 0)
             near = np.sort(tree.query(area.polygon, predicate="dwithin", distance=SLOT_REACH)).tolist()
             on_it = np.flatnonzero(shapely.dwithin(np.array(self.blocked, dtype=object), area.polygon, 1.0))
@@ -310,18 +285,15 @@ class _LotImport(MapImport):
         )
         shapely.prepare(corridors)
         for k, road in enumerate(self.roads):
-            for side in ("left", "right"):
-                tagged = side
-                if road.turned:
-                    tagged = "left" if side == "right" else "right"
-                kerb = kerb_of(road.tags, tagged)  # type: ignore[arg-type]
+            for side in SIDES:
+                tagged = road.side_of_way(side)
+                kerb = kerb_of(road.tags, tagged)
                 if isinstance(kerb, str):
                     self.left_out[kerb].append(f"{road.id}-{tagged}")
                 if kerb is None or isinstance(kerb, str):
                     continue
                 slots = kerb_slots(road, side, kerb, junctions.closed_intervals(k, side))
-                clear = np.flatnonzero(~shapely.intersects(corridors, slots.boxes(shrink=0.05)))
-                slots = slots[clear]
+                slots = slots[~shapely.intersects(corridors, slots.boxes(shrink=0.05))]
                 self._add_row(KERBSIDE, road.id, f"{road.id}-{tagged}", slots, road.rank)
                 if kerb.capacity is not None and len(slots) < kerb.capacity:
                     self.notes.append(
@@ -352,7 +324,7 @@ class _LotImport(MapImport):
             entries = (
                 street_junctions(roads, streets)
                 if edge is None
-                else open_ends(roads, edge, self.points(_is_blind_end))
+                else open_ends(roads, edge, self.points(is_blind_end))
             )
         goals, goal_note = points_in_frame(self.frame, self.options.goals), None
         if not len(goals):
@@ -380,7 +352,7 @@ class _LotImport(MapImport):
         return replace(
             draft,
             found=(*self._found(draft, roads, goal_note), *turns.found),
-            left_out=(*self.all_left_out(), *turns.left_out, *draft.left_out),
+            left_out=(*LeftOut.by_reason(self.left_out), *turns.left_out, *draft.left_out),
         )
 
     def _without_overlaps(self) -> tuple[list[_Slot], Slots]:
@@ -409,7 +381,8 @@ class _LotImport(MapImport):
         elif not len(slots):
             yield "no slot: nothing that the file calls parking could be used"
         if len(slots) and roads and not len(entries):
-            ends = self.frame.to_lonlat(dead_ends(roads))[:3, ::-1].tolist()
+            at = np.array([xy for _, xy, _ in road_ends(roads)]).reshape(-1, 2)
+            ends = self.frame.to_lonlat(at)[:3, ::-1].tolist()
             where = (
                 "; lanes end at " + " and ".join(f"{lat:.6f},{lon:.6f}" for lat, lon in ends) if ends else ""
             )
@@ -443,10 +416,6 @@ class _LotImport(MapImport):
         yield f"frame: {self.frame}"
 
 
-def is_crossing(element: OsmElement) -> bool:
-    return element.tags.get("highway") == "crossing"
-
-
 def _is_parking(element: OsmElement) -> bool:
     tags = element.tags
     return tags.get("amenity") in ("parking", "parking_space") or (
@@ -458,23 +427,16 @@ def refuse_far_away(elements: Sequence[OsmElement]) -> None:
     """Raise an error for a map of more than one place: a plane cannot preserve distances across a continent."""
     positions = np.concatenate([line for e in elements for line in e.lines])
     order = len(positions) // 2
-    lon, lat = (float(np.partition(degrees, order)[order]) for degrees in positions.T)
-    frame = LocalFrame(lon, lat)
-    for element in elements:
-        for line in element.lines:
-            away = np.hypot(*frame.to_xy(line).T)
-            if away.max() > FARTHEST:
-                there_lon, there_lat = line[away.argmax()]
-                raise InputError(
-                    f"{element.id} is at {there_lat:.4f}, {there_lon:.4f} and most of the map "
-                    f"{away.max() / 1e3:,.0f} km away at {lat:.4f}, {lon:.4f}, want a map no larger than "
-                    f"{FARTHEST / 1e3:.0f} km around its middle (are latitude and longitude swapped?)"
-                )
-
-
-def _is_blind_end(element: OsmElement) -> bool:
-    tags = element.tags
-    return tags.get("noexit") == "yes" or tags.get("highway") in ("turning_circle", "turning_loop")
+    lon, lat = np.partition(positions, order, axis=0)[order].tolist()
+    away = np.hypot(*LocalFrame(lon, lat).to_xy(positions).T)
+    if away.max() > FARTHEST:
+        k = int(away.argmax())
+        names = [e.id for e in elements for line in e.lines for _ in line]
+        raise InputError(
+            f"{names[k]} is at {positions[k, 1]:.4f}, {positions[k, 0]:.4f} and most of the map "
+            f"{away[k] / 1e3:,.0f} km away at {lat:.4f}, {lon:.4f}, want a map no larger than "
+            f"{FARTHEST / 1e3:.0f} km around its middle (are latitude and longitude swapped?)"
+        )
 
 
 MOST_SPACES = 20_000  # maximum number of spaces of one lot
@@ -503,13 +465,12 @@ def outline_draft(
         [a for a in areas_of(elements, frame, wanted, mended=True) if shapely.area(a.polygon)]
         for wanted in (is_building, is_parking_area)
     )
-    kept, unused = usable_spaces(areas, parking, with_disabled=options.with_disabled)
+    kept, unused = usable_spaces(areas, parking)
     left_out: dict[str, list[str]] = {}
     for area, reason in unused:
         left_out.setdefault(reason, []).append(area.element.id)
     if not kept:
-        listed = "; ".join(str(LeftOut(reason, tuple(members))) for reason, members in left_out.items())
-        raise InputError(f"no parking space for cars: {listed}")
+        raise InputError(f"no parking space for cars: {'; '.join(map(str, LeftOut.by_reason(left_out)))}")
     ids, polygons = zip(*(part for a in kept for part in split_space(a.element, a.polygon, [])), strict=True)
     spaces = spaces_from_outlines(ids, np.array(polygons, dtype=object))
     obstacles = [*(a.polygon for a in buildings), *(a.polygon for a, _ in unused)]
@@ -591,7 +552,6 @@ class CarPark:
 def import_car_parks(
     path: str | Path, options: ImportOptions, least: int = LEAST_SPACES
 ) -> Iterator[CarPark]:
-    """Yield the car parks of a town, groups of at least `least` spaces, the largest first."""
     path = Path(path)
     place = read_map(path)
     with naming(path):

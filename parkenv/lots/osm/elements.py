@@ -30,7 +30,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, with_extra
 from parkenv.files.limited_reading import read_json, require_file, unpacked_path
 from parkenv.lots.draft import LeftOut
-from parkenv.lots.formats.positions import Positions
+from parkenv.lots.formats.geojson import Positions
 
 OSM_ID = re.compile(r"(node|way|relation)/-?\d+")
 MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
@@ -64,7 +64,6 @@ class OsmElement:
 
     @property
     def is_closed(self) -> bool:
-        """Whether all of its lines are closed, i.e. enclose an area."""
         return all(map(_is_ring, self.lines))
 
     def closed(self) -> OsmElement:
@@ -84,13 +83,15 @@ class OsmTurn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OsmMap:
-    """What a file holds."""
-
     elements: list[OsmElement]  # the tagged nodes, ways and multipolygons, in order
     positions: Positions = field(default_factory=Positions)  # what the positions in the file are
     left_out: tuple[LeftOut, ...] = ()  # those without an outline or a line
     turns: tuple[OsmTurn, ...] = ()  # those restricted for cars
     turns_left_out: tuple[LeftOut, ...] = ()  # restrictions of turns that are not read
+
+    def cut_elements(self) -> tuple[str, ...]:
+        cut = [e.id for e in self.elements if e.cut]
+        return tuple(map(str, LeftOut.by_reason({"cut at the edge of the map": cut})))
 
     def within(self, bounds: tuple[tuple[float, float], tuple[float, float]]) -> OsmMap:
         """Cut roads at a box, two corners of latitude and longitude; others need half of their corners inside."""
@@ -115,11 +116,8 @@ class OsmMap:
             raise InputError(
                 f"nothing of the map is within latitudes and longitudes {bounds[0]} to {bounds[1]}"
             )
-        left_out = (
-            *self.left_out,
-            *([LeftOut("clipped: outside the bounds", tuple(beyond))] if beyond else []),
-        )
-        return replace(self, elements=kept, left_out=left_out)
+        outside = LeftOut.by_reason({"clipped: outside the bounds": beyond})
+        return replace(self, elements=kept, left_out=(*self.left_out, *outside))
 
 
 def read_map(path: Path) -> OsmMap:
@@ -129,7 +127,7 @@ def read_map(path: Path) -> OsmMap:
     with naming(path):
         if not isinstance(content, dict) or not isinstance(content.get("features"), list):
             raise InputError("no features, want a GeoJSON FeatureCollection, or a map as .osm or .osm.pbf")
-        return _map_of_geojson(content["features"], Positions.of(content, path))
+        return _map_of_geojson(content["features"], Positions.of(content))
 
 
 def place_name(path: Path) -> str:
@@ -169,8 +167,6 @@ class _NoTurnError(Exception):
 
 
 class _Way(NamedTuple):
-    """A way with references to its nodes."""
-
     tags: dict[str, str]
     refs: list[int]
 
@@ -185,8 +181,6 @@ class _Relation(NamedTuple):
 
 @dataclass
 class _RawElements:
-    """Elements as read, with unresolved references."""
-
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
     node_tags: dict[int, dict[str, str]] = field(default_factory=dict)
     ways: dict[int, _Way] = field(default_factory=dict)
@@ -250,11 +244,8 @@ class _RawElements:
                 turns += self._turns(f"relation/{i}", raw)
             except _NoTurnError as reason:
                 no_turns[str(reason)].append(f"relation/{i}")
-        left_out, turns_left_out = (
-            tuple(LeftOut(reason, tuple(ids)) for reason, ids in listed.items())
-            for listed in (self.left_out, no_turns)
-        )
-        return OsmMap(nodes + ways + areas, Positions(), left_out, tuple(turns), turns_left_out)
+        left_out, no_turns_read = LeftOut.by_reason(self.left_out), LeftOut.by_reason(no_turns)
+        return OsmMap(nodes + ways + areas, Positions(), left_out, tuple(turns), no_turns_read)
 
     def _turns(self, name: str, relation: _Relation) -> list[OsmTurn]:
         tags = relation.tags
@@ -302,8 +293,7 @@ class _RawElements:
         cut = bool(np.isnan(line).any())
         if not cut:
             return OsmElement(name, way.tags, (line,)) if len(line) > 1 else None
-        inside = line[~np.isnan(line[:, 0])]
-        lines = _runs(line) if "highway" in way.tags else _closed([inside])
+        lines = _runs(line) if "highway" in way.tags else _closed([line[~np.isnan(line[:, 0])]])
         if not lines:
             self.left_out["ways beyond the edge of the map"].append(name)
             return None
@@ -405,45 +395,34 @@ def _read_osm(path: Path) -> OsmMap:
 
 def _map_of_geojson(features: list[Any], positions: Positions) -> OsmMap:
     to_lonlat = positions.to_lonlat if positions.converts else None
-    elements: dict[str, tuple[int, OsmElement]] = {}
+    elements: dict[str, OsmElement] = {}
     for index, feature in enumerate(features):
         element = _feature_element(index, feature, to_lonlat)
-        if element is None:
-            continue
-        first = elements.setdefault(element.id, (index, element))[0]
-        if first != index:
-            raise InputError(f"{element.id} appears twice, as features[{first}] and features[{index}]")
-    listed = [element for _, element in elements.values()]
+        if element is not None and elements.setdefault(element.id, element) is not element:
+            raise InputError(f"{element.id} appears twice, the second time as features[{index}]")
     if _holds_outlines(features):
-        listed = [replace(element, tags={"amenity": "parking_space"}) for element in listed]
-    return OsmMap(listed, positions)
+        tags = {"amenity": "parking_space"}
+        elements = {name: replace(element, tags=tags) for name, element in elements.items()}
+    return OsmMap(list(elements.values()), positions)
 
 
 def _feature_element(
     index: int, feature: Any, to_lonlat: Callable[[FloatArray], FloatArray] | None
 ) -> OsmElement | None:
-    """Convert a GeoJSON feature; None without a usable geometry."""
     if not isinstance(feature, dict):
         raise InputError(f"features[{index}] is {feature!r:.40}, want a GeoJSON feature")
     properties = feature["properties"] if _is_object(feature, "properties") else {}
-    name = next(
-        (
-            given
-            for given in (properties.get("@id"), feature.get("id"), properties.get("id"))
-            if isinstance(given, str) and OSM_ID.fullmatch(given)
-        ),
-        f"feature/{index}",
-    )
-    tags = _tags(properties["tags"] if _is_object(properties, "tags") else properties)
+    ids = (properties.get("@id"), feature.get("id"), properties.get("id"))
+    known = (given for given in ids if isinstance(given, str) and OSM_ID.fullmatch(given))
+    name = next(known, f"feature/{index}")
+    values = properties["tags"] if _is_object(properties, "tags") else properties
+    tags = {str(key): str(value) for key, value in values.items() if isinstance(value, str | int | float)}
     geometry = feature["geometry"] if _is_object(feature, "geometry") else {}
     coordinates = geometry.get("coordinates")
 
     def line(positions: Any) -> FloatArray:
-        if (
-            not isinstance(positions, list)
-            or not positions
-            or not all(isinstance(p, list) and len(p) >= 2 for p in positions)
-        ):
+        listed = positions if isinstance(positions, list) else ()
+        if not listed or not all(isinstance(p, list) and len(p) >= 2 for p in listed):
             raise InputError(f"{name}: coordinates are {positions!r:.40}, want positions")
         points: Any = positions
         with suppress(TypeError, ValueError, OverflowError):  # named below
@@ -459,22 +438,14 @@ def _feature_element(
             return OsmElement(name, tags, lines) if len(lines[0]) > 1 else None
         case "Polygon" | "MultiPolygon" as shape:
             polygons = [coordinates] if shape == "Polygon" else coordinates
-            if (
-                not isinstance(polygons, list)
-                or not polygons
-                or not all(isinstance(p, list) and p for p in polygons)
+            if not (
+                isinstance(polygons, list) and polygons and all(isinstance(p, list) and p for p in polygons)
             ):
                 raise InputError(f"{name}: coordinates are {coordinates!r:.40}, want rings")
             rings = [[line(ring) for ring in polygon] for polygon in polygons]
             holes = tuple(hole for polygon in rings for hole in polygon[1:])
             return OsmElement(name, tags, tuple(polygon[0] for polygon in rings), holes)
     return None
-
-
-def _tags(values: object) -> dict[str, str]:
-    if not isinstance(values, dict):
-        return {}
-    return {str(key): str(value) for key, value in values.items() if isinstance(value, str | int | float)}
 
 
 def _is_object(holder: Mapping[str, Any], key: str) -> bool:

@@ -1,13 +1,11 @@
 """Roads open to cars, from OpenStreetMap tags: their network, entries and turn restrictions."""
 
-from __future__ import annotations
-
 import re
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -69,6 +67,10 @@ class Rank(IntEnum):
     STREET = 2
 
 
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
 @dataclass(frozen=True, eq=False)
 class Road:
     """A way open to cars."""
@@ -80,6 +82,9 @@ class Road:
     oneway: bool  # whether cars may drive only in the order of the points
     # whether the points are in reverse order of the way, which swaps its tags for left and right
     turned: bool
+
+    def side_of_way(self, side: Side) -> Side:
+        return ("right" if side == "left" else "left") if self.turned else side
 
     @property
     def half_width(self) -> float:
@@ -97,19 +102,16 @@ class Road:
         return STREET_WIDTH[self.tags["highway"].removesuffix("_link")] / 2
 
     @property
-    def tagged_limit(self) -> float | None:
+    def limit(self) -> float:
+        """The speed limit, km/h: as tagged, else that of the class."""
         text = self.tags.get("maxspeed", "").strip()
         match = re.fullmatch(r"(\d{1,3})(?: ?(mph|km/h|kmh))?", text)
-        if match is None:
-            return _NAMED_LIMITS.get(text.rpartition(":")[2])
-        return float(match[1]) * (1.609 if match[2] == "mph" else 1.0) or None
-
-    @property
-    def limit(self) -> float:
-        usual = (
-            _AISLE_LIMIT if self.rank is Rank.AISLE else LIMITS[self.tags["highway"].removesuffix("_link")]
-        )
-        return self.tagged_limit or usual
+        if match:
+            tagged = float(match[1]) * (1.609 if match[2] == "mph" else 1.0)
+        else:
+            tagged = _NAMED_LIMITS.get(text.rpartition(":")[2], 0.0)
+        is_aisle = self.rank is Rank.AISLE
+        return tagged or (_AISLE_LIMIT if is_aisle else LIMITS[self.tags["highway"].removesuffix("_link")])
 
     @property
     def has_kerb_parking(self) -> bool:
@@ -120,9 +122,9 @@ class Road:
 def road_of(
     element_id: str, tags: Mapping[str, str], points: FloatArray, *, town: bool = False
 ) -> Road | str | None:
-    """Create a road from a way, (k, 2) m; return a reason if the road is left out, None if the way is not a road.
+    """Create a road from a way, (k, 2) m; return a reason if it is left out, None if it is no road for cars.
 
-    In a town, all that cars drive on counts: motorways, tunnels, and private ways to private parking.
+    In a town, motorways, tunnels and private ways to private parking count, too.
     """
     kind = tags.get("highway", "").removesuffix("_link")
     if kind not in STREET_WIDTH or tags.get("area") == "yes" or (kind == "motorway" and not town):
@@ -131,11 +133,9 @@ def road_of(
     if kind == "service" and service in NOT_FOR_PARKING:
         return f"roads with service={service}"
     reason = closed_to_cars(tags)
-    if town and kind == "service" and reason is not None and reason.endswith("=private"):
+    if town and kind == "service" and (reason or "").endswith("=private"):
         reason = None
-    if not town or kind == "service":
-        reason = reason or off_the_ground(tags)
-    if reason:
+    if reason := reason or (off_the_ground(tags) if not town or kind == "service" else None):
         return f"roads with {reason}"
     as_built = kind == "motorway" or tags.get("junction") in ("roundabout", "circular")
     oneway = tags.get("oneway", "yes" if as_built else "no")
@@ -182,18 +182,14 @@ def closed_to_cars(tags: Mapping[str, str]) -> str | None:
 
 
 def off_the_ground(tags: Mapping[str, str]) -> str | None:
-    """Return the tag that places an element underground or on a deck, or None."""
-    if tags.get("tunnel", "no") not in ("no", "building_passage"):
-        return f"tunnel={tags['tunnel']}"
-    if tags.get("location") in ("underground", "indoor", "roof"):
-        return f"location={tags['location']}"
-    if tags.get("indoor", "no") != "no":
-        return f"indoor={tags['indoor']}"
-    if tags.get("level", "0") != "0":
-        return f"level={tags['level']}"
-    if tags.get("layer", "0").startswith("-"):
-        return f"layer={tags['layer']}"
-    return None
+    is_off = {
+        "tunnel": tags.get("tunnel", "no") not in ("no", "building_passage"),
+        "location": tags.get("location") in ("underground", "indoor", "roof"),
+        "indoor": tags.get("indoor", "no") != "no",
+        "level": tags.get("level", "0") != "0",
+        "layer": tags.get("layer", "0").startswith("-"),
+    }
+    return next((f"{key}={tags[key]}" for key, off in is_off.items() if off), None)
 
 
 def metres(text: str | None) -> float | None:
@@ -230,13 +226,14 @@ def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
 
 def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> list[Road]:
     """Return the roads connected to slots, without service roads that lead neither to a slot nor to one `around`."""
-    parts = components_with_slots(roads, slots)
-    kept = [road for part in parts for road in part]
+    kept = [road for part in components_with_slots(roads, slots) for road in part]
     serving = _serving_roads(kept, slots)
     while True:
-        shared = _shared_node_counts(kept, around)
+        along = [set(labels.tolist()) for labels in _road_nodes([*kept, *around])]
+        users = Counter(label for labels in along for label in labels)
         loose = [
-            road.rank < Rank.STREET and k not in serving and shared[k] < 2 for k, road in enumerate(kept)
+            road.rank < Rank.STREET and k not in serving and sum(users[n] > 1 for n in along[k]) < 2
+            for k, road in enumerate(kept)
         ]
         if not any(loose):
             return kept
@@ -276,8 +273,7 @@ def _serving_roads(roads: Sequence[Road], slots: Slots) -> set[int]:
     if not roads or not len(slots):
         return set()
     lines = np.array([shapely.LineString(road.points) for road in roads])
-    nearest = shapely.STRtree(lines).nearest(shapely.points(slots.mouths()))
-    return set(np.asarray(nearest).tolist())
+    return set(np.asarray(shapely.STRtree(lines).nearest(shapely.points(slots.mouths()))).tolist())
 
 
 def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road]]:
@@ -292,21 +288,10 @@ def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road
     return [[r for r, p in zip(roads, part, strict=True) if p == k] for k in sorted(serving)]
 
 
-def _shared_node_counts(roads: Sequence[Road], around: Sequence[Road]) -> list[int]:
-    along = [set(p.tolist()) for p in _road_nodes([*roads, *around])]
-    users: dict[int, int] = {}
-    for labels in along:
-        for label in labels:
-            users[label] = users.get(label, 0) + 1
-    return [sum(users[label] > 1 for label in labels) for labels in along[: len(roads)]]
-
-
 def street_junctions(roads: Sequence[Road], streets: Sequence[Road]) -> FloatArray:
     """Return the nodes that a road shares with a street, where cars turn in, (n, 2) m."""
-    if not streets:
-        return np.empty((0, 2))
     along = _road_nodes([*roads, *streets])
-    public = set(np.concatenate(along[len(roads) :]).tolist())
+    public = {label for labels in along[len(roads) :] for label in labels.tolist()}
     shared: dict[int, FloatArray] = {}
     for road, on_road in zip(roads, along, strict=False):
         # Cars cannot enter at the end of a one-way road.
@@ -315,10 +300,6 @@ def street_junctions(roads: Sequence[Road], streets: Sequence[Road]) -> FloatArr
             if int(on_road[i]) in public:
                 shared.setdefault(int(on_road[i]), road.points[i])
     return np.array(list(shared.values())).reshape(-1, 2)
-
-
-def dead_ends(roads: Sequence[Road]) -> FloatArray:
-    return np.array([xy for _, xy, _ in road_ends(roads)]).reshape(-1, 2)
 
 
 def road_ends(roads: Sequence[Road]) -> list[tuple[Road, FloatArray, bool]]:
@@ -352,11 +333,9 @@ class Turns(NamedTuple):
 def turns_of(
     place: OsmMap, frame: LocalFrame, whole: Sequence[Lane], lanes: Sequence[Lane], *, away: bool = True
 ) -> Turns:
-    """Return the turns of a lot.
+    """Return the turns of a lot; restrictions away from its lanes are listed if `away`.
 
-    Left out are those whose streets are no lanes of the lot, those at junctions that were split (`whole` are the lanes
-    before), and those with which some street could not be reached, or left, that can be without: the map is incomplete
-    there. Restrictions away from the lanes are listed, too, if `away`.
+    Left out are those on no lane, at split junctions (`whole` are the lanes before), and that would cut streets off.
     """
     named = [(turn.id, Turn(frame.to_xy(turn.line), turn.only)) for turn in place.turns]
     why = [NO_LANE] * len(named)
@@ -364,18 +343,15 @@ def turns_of(
         at = np.array([turn.points[1] for _, turn in named])
         before, after = _arms_at(whole, at), _arms_at(lanes, at)
         if not away:
-            named = [one for one, arms in zip(named, before, strict=True) if arms]
+            named = [named[i] for i in np.flatnonzero(before).tolist()]
             before, after = before[before > 0], after[before > 0]
-        split = (before != after).tolist()
-        why = _reasons(lanes, [turn for _, turn in named], split)
+        why = _reasons(lanes, [turn for _, turn in named], (before != after).tolist())
     kept = {relation for (relation, _), reason in zip(named, why, strict=True) if not reason}
-    listed: dict[str, dict[str, None]] = defaultdict(dict)
+    listed: dict[str, dict[str, None]] = {}
     for (relation, _), reason in zip(named, why, strict=True):
         if relation not in kept:
-            listed[reason][relation] = None
-    left_out = [LeftOut(reason, tuple(those)) for reason, those in listed.items()]
-    if away:
-        left_out += place.turns_left_out
+            listed.setdefault(reason, {})[relation] = None
+    left_out = (*LeftOut.by_reason(listed), *(place.turns_left_out if away else ()))
     n_out = sum(len(left.ids) for left in left_out)
     reasons = ", ".join(f"{left.reason}: {len(left.ids)}" for left in left_out)
     line = f"turn restrictions: {len(kept)} kept" + (f", {n_out} left out ({reasons})" if n_out else "")
@@ -396,8 +372,8 @@ def _reasons(lanes: Sequence[Lane], turns: Sequence[Turn], split: Sequence[bool]
     chains = centrelines([(lane.points, lane.oneway, lane.speed) for lane in lanes]).chains
     rules = rules_of(chains, [(turn.points, turn.only) for turn in turns])
     why = [
-        SPLIT if its else "" if isinstance(rule, Rule) else NO_LANE
-        for its, rule in zip(split, rules, strict=True)
+        SPLIT if is_split else "" if isinstance(rule, Rule) else NO_LANE
+        for is_split, rule in zip(split, rules, strict=True)
     ]
     left = [(i, rule) for i, rule in enumerate(rules) if isinstance(rule, Rule) and not why[i]]
     kept = _without_cuts(chains, [rule for _, rule in left])
@@ -413,7 +389,7 @@ def _without_cuts(chains: Chains, rules: Sequence[Rule]) -> BoolArray:
     kept = inside.copy()
 
     def lost() -> BoolArray:
-        return whole & ~connected(chains, [rule for rule, its in zip(rules, kept, strict=True) if its])
+        return whole & ~connected(chains, [rules[i] for i in np.flatnonzero(kept).tolist()])
 
     while (cut := np.flatnonzero(lost())).size:
         touching = kept & np.isin(node, [chains.first[cut], chains.last[cut]])

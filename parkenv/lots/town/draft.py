@@ -1,6 +1,6 @@
 """Import a whole town from OpenStreetMap: streets, kerbs, car parks and garages with their rules, goals and entries.
 
-- Streets: `parkenv.lots.town.streets`; kerbs: `kerbs`; goals: `attraction`.
+- Streets: `parkenv.lots.town.streets`; kerbs: `supply`.
 - Car parks whose spaces are drawn (`amenity=parking_space`) are slots. Others are counted: as many cars as `capacity`
   says, else by `capacity`'s rules of area and levels. Where more are tagged than drawn, the others are counted, too.
 - A garage (`parking=multi-storey`, `underground`, `rooftop`) has a barrier that takes 10 s a car, 30 s to a space when
@@ -10,12 +10,13 @@
 - Rules (`fee`, `charge`, `maxstay`, `access`, `capacity:disabled`, `capacity:charging`) become zones, named after the
   kind of facility and the rule (`zones`).
 - Buildings are no walls: a town is searched without sensors.
+- Goals: a building attracts by its floor area: outline times levels (tagged, or usual for its kind), and a shop,
+  restaurant, office or the like that is mapped as a point by a nominal area, whom `BUILDINGS` and `POINTS` say; one of
+  unknown kind is a dwelling, unless a point within it says otherwise. What is near each other becomes one goal.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,49 +25,50 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, with_extra
 from parkenv.files.file_names import is_plain
-from parkenv.lots.draft import LotDraft
-from parkenv.lots.generators import NO_SLOTS, Slots
+from parkenv.lots.draft import LeftOut, LotDraft
+from parkenv.lots.generators import NO_SLOTS, Slots, nearest_on_lanes
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.areas import (
-    CAR_SPACES,
-    Area,
-    is_building,
-    is_parking_area,
-    is_space,
-)
 from parkenv.lots.osm.draft import (
     MAPPED_OVERLAP,
     NO_AISLE,
     RULE_OVERLAP,
     MapImport,
-    cut_elements,
-    is_crossing,
     refuse_far_away,
 )
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
+from parkenv.lots.osm.parking import (
+    CAR_SPACES,
+    CORRIDOR,
+    Area,
+    exterior_rings,
+    is_building,
+    is_crossing,
+    is_parking_area,
+    is_space,
+    without_overlaps,
+)
 from parkenv.lots.osm.roads import Rank, Turns, off_the_ground, turns_of, whole_number
-from parkenv.lots.osm.rows import CORRIDOR, without_overlaps
-from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.lots.town.attraction import PURPOSES, find_goals
-from parkenv.lots.town.kerbs import CLASS_RULE, STRIPS, kerb_sides, strip_side
 from parkenv.lots.town.streets import read_streets
 from parkenv.lots.town.supply import (
+    CLASS_RULE,
     GARAGES,
     PRICE,
+    STRIPS,
     FacilityRow,
     ListedCarPark,
     Rules,
     expected_capacity,
     facilities_of,
+    kerb_sides,
     levels_of,
     matched,
     read_listed,
     rule_of,
     rules_of,
+    strip_side,
     table_of,
-    zones_of,
 )
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_REACH
@@ -80,9 +82,14 @@ RESERVED_PLACES = ("disabled", "charging")
 """Classes of users whose places a car park may count apart: `capacity:disabled`, `capacity:charging`."""
 PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
 """Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it."""
+NO_ENTRY = "no entry: no street crosses the edge of the map"
+TOO_FAR = f"parking farther than {FACILITY_REACH:g} m from every street"
 NO_GOAL = "no goal: no building and no point of interest in it; export buildings and shops, too"
-CLOSED = ("no", "military", "forestry", "agricultural")
-"""Values of `access` of parking that no car in town may use."""
+CLOSED = {
+    "parking": ("construction", "disused", "abandoned"),
+    "access": ("no", "military", "forestry", "agricultural"),
+}
+"""Values of tags of parking that no car in town may use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,13 +124,8 @@ def import_town(
 ) -> TownDraft:
     """Draft a town from an OpenStreetMap file; see the module for the rules.
 
-    Args:
-        path: the file.
-        car_parks: list of car parks, such as those that the city counts; their names and capacities win (`listed`).
-        listed_only: whether kerbs, other car parks, and streets on no shortest way between entries and these are left
-            out.
-        bounds: two corners, each a latitude and a longitude, at which the map is cut; None: all of it.
-        untagged_kerbs: places of kerbs that the map says nothing of, as a multiple of the rule's.
+    Names and capacities of a list of car parks win; `listed_only` leaves out other parking and streets on no shortest
+    way to them. The map is cut at `bounds`, two pairs of latitude and longitude; `untagged_kerbs` multiplies places.
     """
     path = Path(path)
     listed = [] if car_parks is None else read_listed(Path(car_parks))
@@ -142,8 +144,6 @@ def import_town(
 
 
 class _TownImport(MapImport):
-    """The state of an import of a town: its streets, car parks, and a row for each facility."""
-
     def __init__(self, name: str, place: OsmMap) -> None:
         # What an extract's edge cuts may have lost its nodes, too.
         elements = [e.closed() if is_parking_area(e) and not e.is_node else e for e in place.elements]
@@ -154,7 +154,7 @@ class _TownImport(MapImport):
         frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
         super().__init__(name, replace(place, elements=elements), frame)
         self.streets, self.closed_roads = read_streets(elements, self.frame)
-        self.roads = self.streets.roads_kept()
+        self.roads = self.streets.roads_of(self.streets.kept)
         self.lines = linestrings([road.points for road in self.roads])
         self.tree = shapely.STRtree(self.lines)
         self.buildings = self.areas(is_building, mended=True)
@@ -169,19 +169,16 @@ class _TownImport(MapImport):
         self.listed: list[str] = []  # which facilities car parks of a list are
 
     def _is_open(self, element: OsmElement) -> bool:
-        tags = element.tags
-        reason = f"access={tags['access']}" if tags.get("access") in CLOSED else None
-        if tags.get("parking") in ("construction", "disused", "abandoned"):
-            reason = f"parking={tags['parking']}"
-        if reason is not None:
-            self.left_out[f"parking with {reason}"].append(element.id)
-        return reason is None
+        for key, closed in CLOSED.items():
+            if (value := element.tags.get(key)) in closed:
+                self.left_out[f"parking with {key}={value}"].append(element.id)
+                return False
+        return True
 
     def _named(self, tags: Any, element_id: str) -> str:
         name = str(tags.get("name", ""))
         name = name if name and is_plain(name) else element_id
-        if name in self.names:
-            name = f"{name} ({element_id})"
+        name = f"{name} ({element_id})" if name in self.names else name
         self.names.add(name)
         return name
 
@@ -190,10 +187,10 @@ class _TownImport(MapImport):
         spaces = []
         for area in self.areas(is_space, mended=True):
             tags, kind = area.element.tags, area.element.tags.get("parking_space", "normal")
-            reason = off_the_ground(tags) or (
-                f"access={tags['access']}" if tags.get("access") in CLOSED else None
-            )
-            if kind not in CAR_SPACES and rules_of(tags).users == "public":
+            reason = off_the_ground(tags)
+            if reason is None and tags.get("access") in CLOSED["access"]:
+                reason = f"access={tags['access']}"
+            if kind not in CAR_SPACES and rules_of(tags).users == PUBLIC:
                 reason = f"parking_space={kind}"
             if area.element.cut:
                 reason = "an outline that the edge of the map cuts"
@@ -239,7 +236,6 @@ class _TownImport(MapImport):
         return owner
 
     def read_kerbs(self, untagged: float) -> None:
-        """Read the kerbs: those drawn as areas, those tagged on streets, and those by rule."""
         sides: list[FacilityRow] = []
         for k, area in enumerate(self.parking):
             if area.element.tags.get("parking") in STRIPS and k not in self.used:
@@ -297,20 +293,16 @@ class _TownImport(MapImport):
             rule = rule_of(tags)
             kind = "garage" if rule in GARAGES else "lot"
             rules = rules_of(tags)
-            if rule == "boxes" and rules.users == "public":
+            if rule == "boxes" and rules.users == PUBLIC:
                 rules = replace(rules, users="private")
             xy = self._entrance(shape, entrances if kind == "garage" else [])
             if xy is None:
-                self.left_out[f"parking farther than {FACILITY_REACH:g} m from every street"].append(
-                    element.id
-                )
+                self.left_out[TOO_FAR].append(element.id)
                 continue
             tagged = whole_number(tags.get("capacity"))
-            capacity = tagged or expected_capacity(rule, area, levels_of(tags))
-            source, which = ("tag", "") if tagged else ("rule", rule)
-            name = self._named(tags, element.id)
-            row = FacilityRow(name, kind, rules, source, which, element.id, tagged, xy=xy)
-            rest = capacity
+            source = ("tag", "") if tagged else ("rule", rule)
+            row = FacilityRow(self._named(tags, element.id), kind, rules, *source, element.id, tagged, xy=xy)
+            rest = tagged or expected_capacity(rule, area, levels_of(tags))
             for users in RESERVED_PLACES:
                 n = whole_number(tags.get(f"capacity:{users}")) or 0
                 if 0 < n < rest:
@@ -379,10 +371,7 @@ class _TownImport(MapImport):
             zone=np.array(zone, np.str_),
             facility=np.array([self.rows[k].name for k in of.tolist()], np.str_),
         )
-        serial = np.arange(len(of)) - np.repeat(
-            np.cumsum([0, *map(len, parts)])[:-1], [len(part) for part in parts]
-        )
-        ids = [f"{self.rows[k].element}-{i + 1}" for k, i in zip(of.tolist(), serial.tolist(), strict=True)]
+        ids = [f"{row.element}-{i + 1}" for row in self.rows for i in range(len(row.slots))]
         to_lane = nearest_on_lanes(lanes, slots.mouths())[0] - slots.mouths()
         near = np.hypot(*to_lane.T) < SLOT_REACH - 0.01  # a file rounds
         self.left_out[NO_AISLE] += [ids[i] for i in np.flatnonzero(~near).tolist()]
@@ -395,7 +384,9 @@ class _TownImport(MapImport):
             for row in self.rows
             for rules in (*row.slot_rules, *(r for _, _, r in row.counted), row.rules)
         ]
-        goals, weights = find_goals(self.place.elements, self.buildings, self.frame, self.tree, self.beside)
+        goals, weights = weighted_goals(
+            self.place.elements, self.buildings, self.frame, self.tree, self.beside
+        )
         draft = LotDraft(
             name=self.name,
             slot_ids=tuple(ids),
@@ -404,18 +395,15 @@ class _TownImport(MapImport):
             lanes=tuple(lanes),
             entries=entries,
             goals=goals,
-            outlines=tuple(
-                shapely.get_coordinates(shapely.get_exterior_ring(part))
-                for a in self.parking
-                for part in shapely.get_parts(a.polygon)
-            ),
-            missing=(
-                *(() if len(entries) else ("no entry: no street crosses the edge of the map",)),
-                *(() if len(goals) else (NO_GOAL,)),
+            outlines=tuple(exterior_rings(a.polygon for a in self.parking)),
+            missing=tuple(
+                text for text, points in ((NO_ENTRY, entries), (NO_GOAL, goals)) if not len(points)
             ),
             frame=self.frame,
             facilities=tuple(facilities),
-            zone_rules=zones_of(used),
+            zone_rules={
+                zone.name: zone for zone in (rules.zone(kind) for kind, rules in dict.fromkeys(used))
+            },
             goal_weights=weights,
             entry_weights=dict.fromkeys(PURPOSES, traffic),
             turns=turns.kept,
@@ -425,11 +413,11 @@ class _TownImport(MapImport):
             *self.place.left_out,
             *self.closed_roads,
             *self.streets.unconnected(),
-            *self.all_left_out(),
+            *LeftOut.by_reason(self.left_out),
             *turns.left_out,
             *draft.left_out,
         )
-        found = (*_findings(self, rows, draft), *turns.found, *cut_elements(self.place.elements))
+        found = (*_findings(self, rows, draft), *turns.found, *self.place.cut_elements())
         guesses = tuple(_guesses(rows, draft))
         return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows)
 
@@ -444,8 +432,7 @@ def _unseen_garages(
     alone = np.ones(len(points), bool)
     garages = [a.polygon for a in parking if rule_of(a.element.tags) in GARAGES]
     for outlines, reach in (([a.polygon for a in parking], ENTRANCE_WITHIN), (garages, SAME_GARAGE)):
-        known = shapely.STRtree(outlines).query(points, predicate="dwithin", distance=reach)[0]
-        alone[known] = False
+        alone[shapely.STRtree(outlines).query(points, predicate="dwithin", distance=reach)[0]] = False
     index = np.flatnonzero(alone)
     label = component_labels(
         shapely.STRtree(points[index]).query(points[index], predicate="dwithin", distance=SAME_GARAGE).T,
@@ -459,19 +446,16 @@ def _unseen_garages(
 
 
 def _findings(town: _TownImport, rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
-    whole, connected = town.streets.length.sum() / 1e3, town.streets.connected_share()
-    yield f"streets: {whole:.0f} km, {connected:.1%} of them connected; lanes: {len(draft.lanes)}"
-    yield f"speed limits: {town.streets.tagged_limits():.0%} of the streets by tag, others by class"
+    length, kept, real = town.streets.length, town.streets.kept, ~town.streets.is_beyond
+    connected = length[kept & real].sum() / length[real].sum()
+    yield f"streets: {length.sum() / 1e3:.0f} km, {connected:.1%} of them connected; lanes: {len(draft.lanes)}"
     for kind in ("kerb", "lot", "garage"):
         of_kind = [row for row in rows if row["kind"] == kind]
-        places = {
-            source: sum(r["capacity"] for r in of_kind if r["capacity_from"] == source)
-            for source in ("tag", "drawn", "list", "rule")
-        }
+        places = dict.fromkeys(("tag", "drawn", "list", "rule"), 0)
+        for row in of_kind:
+            places[row["capacity_from"]] += row["capacity"]
         listed = ", ".join(f"{source}: {n:,}" for source, n in places.items() if n)
-        yield f"{kind}s: {len(of_kind):,}, places: {sum(places.values()):,}" + (
-            f" ({listed})" if listed else ""
-        )
+        yield f"{kind}s: {len(of_kind):,}, places: {sum(places.values()):,} ({listed or 'none'})"
     yield f"entries: {len(draft.entries)}, where streets cross the edge of the map"
     yield f"goals: {len(draft.goals)}, of buildings and points of interest"
     yield f"zones: {', '.join(draft.zone_rules)}"
@@ -490,3 +474,138 @@ def _guesses(rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
     if assumed:
         price = draft.zone_rules[assumed[0]].price.per_hour
         yield f"price where the map has a fee without an amount: {price:g} an hour"
+
+
+PURPOSES = ("residents", "commuters", "shoppers", "visitors", "deliveries")
+MOST_GOALS = 100
+APART = 40.0  # m, least distance of goals in a small map, on average
+STREET_WITHIN = 300.0  # m, from the streets of a town, of what attracts anybody
+WALK_WITHIN = 500.0  # m, from car parks whose drivers alone are wanted
+LEAST_AREA = 30.0  # m², of buildings that anybody lives in
+DWELLING = {"residents": 1.0, "visitors": 0.05, "deliveries": 0.05}
+WORK = {"commuters": 1.0, "visitors": 0.1, "deliveries": 0.1}
+SHOP = {"shoppers": 1.0, "commuters": 0.2, "deliveries": 0.4}
+LEISURE = {"visitors": 1.0, "commuters": 0.1, "deliveries": 0.1}
+OPEN_TO_ALL = {"visitors": 0.5, "commuters": 0.5, "deliveries": 0.05}
+BUILDINGS: dict[str, tuple[float, dict[str, float]]] = {
+    **dict.fromkeys(
+        ("house", "detached", "semidetached_house", "terrace", "bungalow", "farm"), (2.0, DWELLING)
+    ),
+    **dict.fromkeys(("yes", "residential", "block"), (2.0, DWELLING)),
+    **dict.fromkeys(("apartments", "dormitory"), (4.0, DWELLING)),
+    **dict.fromkeys(("office", "commercial", "government"), (3.0, WORK)),
+    **dict.fromkeys(
+        ("industrial", "manufacture", "warehouse"), (1.0, {"commuters": 0.3, "deliveries": 0.05})
+    ),
+    **dict.fromkeys(("retail", "supermarket", "kiosk", "mall"), (1.0, SHOP)),
+    **dict.fromkeys(
+        ("hotel", "cinema", "theatre", "stadium", "sports_hall", "sports_centre"), (2.0, LEISURE)
+    ),
+    **dict.fromkeys(("school", "kindergarten", "university", "college", "hospital"), (2.0, OPEN_TO_ALL)),
+    **dict.fromkeys(("public", "civic", "church", "train_station", "fire_station"), (1.0, OPEN_TO_ALL)),
+}
+"""Usual levels of a `building`, and whom a square metre of its floor attracts; of others nobody."""
+POINTS: dict[str, tuple[float, dict[str, float]]] = {
+    "shop": (150.0, SHOP),
+    "office": (200.0, WORK),
+    "craft": (150.0, WORK),
+    "healthcare": (200.0, OPEN_TO_ALL),
+    "tourism": (300.0, LEISURE),
+    "leisure": (300.0, LEISURE),
+    **dict.fromkeys(("restaurant", "pub", "bar", "cafe", "fast_food", "nightclub"), (150.0, LEISURE)),
+    **dict.fromkeys(
+        ("cinema", "theatre", "library", "community_centre", "place_of_worship"), (400.0, LEISURE)
+    ),
+    **dict.fromkeys(("bank", "post_office", "pharmacy", "marketplace"), (200.0, SHOP)),
+    **dict.fromkeys(
+        ("doctors", "dentist", "clinic", "hospital", "townhall", "courthouse"), (300.0, OPEN_TO_ALL)
+    ),
+    **dict.fromkeys(("school", "kindergarten", "university", "college"), (500.0, OPEN_TO_ALL)),
+}
+"""Nominal floor, m², of a point with a key (`shop`, `office`, ...) or an `amenity`, and whom it attracts."""
+QUIET = {
+    "tourism": ("information", "artwork", "viewpoint"),
+    "leisure": ("garden", "pitch", "playground", "park"),
+}
+"""Values of keys that no car comes for."""
+
+
+def weighted_goals(
+    elements: Sequence[OsmElement],
+    buildings: Sequence[Area],
+    frame: LocalFrame,
+    streets: shapely.STRtree,
+    beside: FloatArray | None = None,
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return up to `MOST_GOALS` goals, (n, 2) m, near streets, and points `beside` if given; weights by purpose."""
+    xy, weight = _sources(elements, buildings, frame)
+    near = np.unique(streets.query(shapely.points(xy), predicate="dwithin", distance=STREET_WITHIN)[0])
+    if beside is not None:
+        near = near[shapely.distance(shapely.multipoints(beside), shapely.points(xy[near])) <= WALK_WITHIN]
+    xy, weight = xy[near], weight[near]
+    if not len(xy):
+        return np.empty((0, 2)), {}
+    # Every purpose counts alike where goals lie, however large its numbers are.
+    share = (weight / np.maximum(weight.sum(axis=0), 1e-9)).sum(axis=1)
+    used = share > 0.0
+    xy, weight, share = xy[used], weight[used], share[used]
+    extent = float(np.prod(np.ptp(xy, axis=0) + 1.0))
+    count = min(MOST_GOALS, len(np.unique(np.round(xy), axis=0)), max(int(extent / APART**2), 1))
+    with with_extra("a town", "osm"):
+        from sklearn.cluster import KMeans
+
+    clusters = KMeans(count, n_init=1, max_iter=30, random_state=0).fit(xy, sample_weight=share)
+    label = np.asarray(clusters.labels_, np.int64)
+    total = np.bincount(label, share, minlength=count)
+    kept = np.flatnonzero(total > 0.0)
+    goals = np.stack(
+        [np.bincount(label, share * axis, minlength=count)[kept] / total[kept] for axis in xy.T], axis=1
+    )
+    weights = {
+        purpose: np.round(np.bincount(label, weight[:, k], minlength=count)[kept] / 1e3, 3)
+        for k, purpose in enumerate(PURPOSES)
+    }
+    return goals, {purpose: values for purpose, values in weights.items() if values.any()}
+
+
+def _sources(
+    elements: Sequence[OsmElement], buildings: Sequence[Area], frame: LocalFrame
+) -> tuple[FloatArray, FloatArray]:
+    """Return where anything attracts people, (n, 2) m, and how much, (n, n_purposes) m² of floor."""
+    positions: list[FloatArray] = []
+    rows: list[list[float]] = []
+
+    def add(at: FloatArray, floor: float, kind: Mapping[str, float]) -> None:
+        positions.append(at)
+        rows.append([floor * kind.get(purpose, 0.0) for purpose in PURPOSES])
+
+    area = shapely.area([a.polygon for a in buildings])
+    middle = shapely.get_coordinates(shapely.point_on_surface([a.polygon for a in buildings]))
+    own = {a.element.id for a in buildings}
+    points = [(e, found) for e in elements if e.id not in own and (found := _point_of(e.tags)) is not None]
+    here = np.array([frame.to_xy(e.lines[0]).mean(axis=0) for e, _ in points]).reshape(-1, 2)
+    tree = shapely.STRtree([a.polygon for a in buildings])
+    spoken_for = set(tree.query(shapely.points(here), predicate="intersects")[1].tolist())
+    for (_, (floor, attracts)), at in zip(points, here, strict=True):
+        add(at, floor, attracts)
+    for k, building in enumerate(buildings):
+        tags = building.element.tags
+        levels, attracts = BUILDINGS.get(tags["building"], (1.0, {}))
+        floor = float(area[k]) * (levels_of(tags) or levels)
+        point = _point_of(tags)
+        if point is not None:
+            attracts = point[1]
+        elif tags["building"] == "yes" and k in spoken_for:
+            floor *= 0.5  # shops below, dwellings above
+        if attracts and area[k] >= LEAST_AREA:
+            add(middle[k], floor, attracts)
+    return np.array(positions).reshape(-1, 2), np.array(rows).reshape(-1, len(PURPOSES))
+
+
+def _point_of(tags: Mapping[str, str]) -> tuple[float, dict[str, float]] | None:
+    if found := POINTS.get(tags.get("amenity", "")):
+        return found
+    for key in ("shop", "office", "craft", "healthcare", "tourism", "leisure"):
+        if tags.get(key, "no") not in ("no", "vacant", *QUIET.get(key, ())):
+            return POINTS[key]
+    return None

@@ -7,19 +7,16 @@ crosses the edge within 600 m is assumed. Service roads that lead to no parking 
 limit over 30 km/h: where 30 is allowed, cars drive at the scenario's speed.
 """
 
-from __future__ import annotations
-
 from collections import deque
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import shapely
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 
-from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.infer.network import limit_junctions
@@ -48,28 +45,15 @@ BEYOND = "beyond"  # ids of the ways beyond the edge begin with it
 LONGEST_BEYOND = 600.0  # m, longest way beyond the edge of the map that is assumed
 
 
-@dataclass(frozen=True, eq=False)
 class Streets:
-    """The roads of a town, whole ways that cars may drive, cut into pieces at junctions.
+    """The roads of a town, whole ways that cars may drive, in pieces between junctions; `cut` are those at the edge."""
 
-    `cut` are those cut by the edge.
-    """
-
-    roads: tuple[Road, ...]
-    cut: frozenset[str] = frozenset()
-
-    road: IntArray = field(init=False)  # (n,) of each piece
-    span: IntArray = field(init=False)  # (n, 2) first and last point of the piece on its road
-    nodes: IntArray = field(init=False)  # (n, 2) junction at its start and at its end
-    length: FloatArray = field(init=False)  # (n,) m
-    kept: BoolArray = field(init=False)  # (n,) whether it belongs to the connected part
-    node_xy: FloatArray = field(init=False)  # (n_nodes, 2) m
-
-    def __post_init__(self) -> None:
-        if not self.roads:
+    def __init__(self, roads: tuple[Road, ...], cut: frozenset[str]) -> None:
+        if not roads:
             raise InputError("no street that cars may drive in it")
-        count = np.array([len(road.points) for road in self.roads])
-        xy = np.concatenate([road.points for road in self.roads])
+        self.roads, self.cut = roads, cut
+        count = np.array([len(road.points) for road in roads])
+        xy = np.concatenate([road.points for road in roads])
         label, of = node_labels(xy), np.repeat(np.arange(len(count)), count)
         last = np.cumsum(count) - 1
         is_node = np.bincount(label)[label] > 1
@@ -78,25 +62,27 @@ class Streets:
         same = of[at[:-1]] == of[at[1:]]
         first, end = at[:-1][same], at[1:][same]
         run = np.r_[0.0, np.cumsum(np.hypot(*np.diff(xy, axis=0).T))]
-        node_xy = np.empty((label.max() + 1, 2))
-        node_xy[label[::-1]] = xy[::-1]
-        road = of[first]
-        offset = (last - count + 1)[road]
-        values = {
-            "road": road,
-            "span": np.stack([first - offset, end - offset], axis=1),
-            "nodes": np.stack([label[first], label[end]], axis=1),
-            "length": run[end] - run[first],
-            "node_xy": node_xy,
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
-        part = self._parts("strong")
+        self.node_xy = np.empty((label.max() + 1, 2))  # m
+        self.node_xy[label[::-1]] = xy[::-1]
+        self.road = of[first]  # (n,) of each piece
+        offset = (last - count + 1)[self.road]
+        self.span = np.stack(
+            [first - offset, end - offset], axis=1
+        )  # (n, 2) first and last point on its road
+        self.nodes = np.stack(
+            [label[first], label[end]], axis=1
+        )  # (n, 2) junction at its start and at its end
+        self.length = run[end] - run[first]  # (n,) m
+        self.oneway = np.array([road.oneway for road in roads])[self.road]  # (n,) bool
+        self.is_beyond = np.array([road.id.startswith(BEYOND) for road in roads])[self.road]
+        part = np.asarray(connected_components(self._graph(), connection="strong")[1], np.int64)
         inside = part[self.nodes[:, 0]] == part[self.nodes[:, 1]]
         metres = np.bincount(part[self.nodes[inside, 0]], self.length[inside], minlength=part.max() + 1)
         if not metres.any():
             raise InputError("no street in it leads back to where it began: all are one-way")
-        object.__setattr__(self, "kept", inside & (part[self.nodes[:, 0]] == int(metres.argmax())))
+        self.kept: BoolArray = inside & (
+            part[self.nodes[:, 0]] == int(metres.argmax())
+        )  # (n,) whether in the connected part
 
     def _graph(self, links: Iterable[tuple[int, int]] = ()) -> csr_array[np.float64]:
         """Return which junction leads to which, also by further links, (n_nodes, n_nodes)."""
@@ -106,58 +92,23 @@ class Streets:
         n = len(self.node_xy)
         return csr_array((np.ones(len(source)), (source, target)), shape=(n, n))
 
-    def _parts(self, connection: Literal["weak", "strong"]) -> IntArray:
-        return np.asarray(connected_components(self._graph(), connection=connection)[1], np.int64)
-
-    @property
-    def oneway(self) -> BoolArray:
-        return np.array([road.oneway for road in self.roads])[self.road]
-
     def points(self, piece: int) -> FloatArray:
         first, last = self.span[piece].tolist()
         points: FloatArray = self.roads[self.road[piece]].points[first : last + 1]
         return points
 
-    def connected_share(self) -> float:
-        real = ~self._is_beyond
-        return float(self.length[self.kept & real].sum() / self.length[real].sum())
-
-    @property
-    def _is_beyond(self) -> BoolArray:
-        return np.array([road.id.startswith(BEYOND) for road in self.roads])[self.road]
-
-    def unconnected(self) -> Iterable[LeftOut]:
-        """Yield what is not connected: parts of their own by their longest street, and streets of no return."""
-        part = self._parts("weak")[self.nodes[:, 0]]
-        main = part[self.kept][0]
-        apart: dict[int, list[int]] = {}
-        for piece in np.flatnonzero(part != main).tolist():
-            apart.setdefault(int(part[piece]), []).append(piece)
-        if apart:
-            metres = {k: self.length[pieces].sum() for k, pieces in apart.items()}
-            names = (
-                f"{self._name(max(apart[k], key=lambda p: self.length[p]))} {metres[k]:.0f} m"
-                for k in sorted(apart, key=lambda k: -metres[k])
-            )
-            yield LeftOut("parts of the streets that are not connected to the others", tuple(names))
-        alone = np.flatnonzero((part == main) & ~self.kept)
-        if len(alone):
-            longest = alone[np.argsort(-self.length[alone])].tolist()
-            named = tuple(dict.fromkeys(map(self._name, longest)))
-            yield LeftOut("streets from which no way leads back, or that none leads to", named)
-
-    def _name(self, piece: int) -> str:
-        road = self.roads[self.road[piece]]
-        return str(road.tags.get("name", road.id))
+    def unconnected(self) -> tuple[LeftOut, ...]:
+        alone = np.flatnonzero(~self.kept)
+        roads = [self.roads[k] for k in self.road[alone[np.argsort(-self.length[alone])]].tolist()]
+        names = dict.fromkeys(road.tags.get("name", road.id) for road in roads)
+        return LeftOut.by_reason({"streets that are not connected to the others": names})
 
     def _edge(self) -> tuple[FloatArray, BoolArray, BoolArray]:
         """Return where streets leave the map: their traffic, 0 elsewhere, whether cars come in, and leave, (n_nodes,).
 
-        That is where the edge cuts them, where one of a class that leads on ends, and where another one ends near the
-        hull of all streets; one-way streets do not end, and may be farther from it. Where several of these meet and
-        none leads on, or several begin and none leads there, it does so beyond the edge.
+        That is where the edge cuts them, or where they end and are of a class that leads on, or near the hull of all.
         """
-        real = np.flatnonzero(~self._is_beyond)
+        real = np.flatnonzero(~self.is_beyond)
         n = len(self.node_xy)
         users = np.bincount(self.nodes[real].ravel(), minlength=n)
         two_way = self.nodes[real[~self.oneway[real]]].ravel()
@@ -183,7 +134,6 @@ class Streets:
         return traffic, enters, leaves
 
     def ways_beyond(self) -> list[Road]:
-        """Return the ways beyond the edge of the map that are assumed, so that every way leads back."""
         _, enters, leaves = self._edge()
         start = int(self.nodes[self.kept][0, 0])
         links: dict[tuple[int, int], None] = {}
@@ -236,15 +186,10 @@ class Streets:
         nodes = sorted(brought)
         return self.node_xy[nodes], np.array([brought[node] for node in nodes])
 
-    def roads_kept(self) -> list[Road]:
-        return [replace(self.roads[k], points=points) for k, points in self._runs(self.kept, set())]
-
     def lanes(self, mouths: FloatArray, entries: FloatArray | None = None) -> tuple[list[Lane], list[Lane]]:
-        """Return the lanes before and after junctions are split: the connected part that leads to the mouths, (n, 2) m.
+        """Return the lanes before and after junctions are split: those that lead to the mouths, (n, 2) m.
 
-        Service roads that lead to none are left out. Ways are cut at junctions with more than four ways out, so that
-        `limit_junctions` can split these. With entries, (m, 2) m, only the shortest ways between these and the mouths
-        are left, each as long lanes as there can be.
+        With entries, (m, 2) m, only the shortest ways between these and the mouths are left.
         """
         kept = self._useful(mouths)
         if entries is not None:
@@ -253,10 +198,7 @@ class Streets:
         back = ~self.oneway[kept]
         ways_out = np.bincount(np.r_[a, b[back]], minlength=len(self.node_xy))
         crowded = set(np.flatnonzero(ways_out > len(MOVES)).tolist())
-        whole = [
-            Lane(points, self.roads[k].oneway, _speed(self.roads[k]))
-            for k, points in self._runs(kept, crowded)
-        ]
+        whole = [Lane(road.points, road.oneway, _speed(road)) for road in self.roads_of(kept, crowded)]
         lanes = limit_junctions(whole)
         return whole, lanes if entries is None else _joined(lanes, mouths)
 
@@ -294,13 +236,8 @@ class Streets:
                     node = tree[node]
         return wanted
 
-    def tagged_limits(self) -> float:
-        known = np.array([road.tagged_limit is not None for road in self.roads])[self.road]
-        is_street = np.array([road.rank is Rank.STREET for road in self.roads])[self.road] & ~self._is_beyond
-        return float(self.length[known & is_street].sum() / max(self.length[is_street].sum(), 1e-9))
-
-    def _runs(self, kept: BoolArray, cuts: set[int]) -> list[tuple[int, FloatArray]]:
-        """Join consecutive pieces of one road: its index and its points, cut at some junctions."""
+    def roads_of(self, kept: BoolArray, cuts: Collection[int] = ()) -> list[Road]:
+        """Return pieces as roads, consecutive ones of one way as one, but cut at some junctions."""
         runs: list[tuple[int, list[FloatArray]]] = []
         before = -1
         for piece in np.flatnonzero(kept).tolist():
@@ -310,7 +247,7 @@ class Streets:
             else:
                 runs.append((int(self.road[piece]), [self.points(piece)]))
             before = piece
-        return [(k, np.concatenate(parts)) for k, parts in runs]
+        return [replace(self.roads[k], points=np.concatenate(parts)) for k, parts in runs]
 
     def _useful(self, mouths: FloatArray) -> BoolArray:
         """Return the pieces kept, without dead ends of service roads that are nearest to no mouth, (n,) bool."""
@@ -362,11 +299,8 @@ def _joined(lanes: Sequence[Lane], mouths: FloatArray) -> list[Lane]:
     ]
 
 
-def read_streets(elements: Sequence[OsmElement], frame: LocalFrame) -> tuple[Streets, list[LeftOut]]:
-    """Return the streets of a map, motorways and tunnels among them, and the roads left out."""
+def read_streets(elements: Sequence[OsmElement], frame: LocalFrame) -> tuple[Streets, tuple[LeftOut, ...]]:
     left_out: dict[str, list[str]] = {}
     roads = read_roads(elements, frame, left_out, town=True)
     cut = frozenset(element.id for element in elements if element.cut)
-    listed = [LeftOut(reason, tuple(ids)) for reason, ids in left_out.items()]
-    streets = Streets(tuple(roads), cut)
-    return Streets((*roads, *streets.ways_beyond()), cut), listed
+    return Streets((*roads, *Streets(tuple(roads), cut).ways_beyond()), cut), LeftOut.by_reason(left_out)

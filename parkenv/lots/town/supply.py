@@ -1,29 +1,46 @@
-"""Rules, capacities and facilities of a town's parking, from tags and from a city's list of car parks.
+"""Kerbs, car parks and garages of a town: places, rules and facilities, from tags and from a city's list of car parks.
 
 Tags that say less than a zone needs are completed: parking with a fee but no `charge` costs `PRICE` an hour.
+
+Kerbs are read in both tagging schemes, see `parkenv.lots.osm.parking`. A tagged kerb without a capacity has a place for
+every `METRES_PER_PLACE`; one whose tags say nothing of parking has `PLACES_PER_METRE` of its class, where houses stand
+beside it, and none on bridges, in tunnels and at roundabouts. Of main roads, one-way ones are one half of a dual
+carriageway: all places are on the right. Kerbs that are drawn as areas (`parking=street_side` and the like) are places
+along the nearest street.
 """
 
-from __future__ import annotations
-
 import re
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, ConfigDict, Field
 from scipy.optimize import linear_sum_assignment
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
-from parkenv.files.csv_tables import TEXT, WHOLE, Kind, typed_records
-from parkenv.files.file_names import is_plain
-from parkenv.files.limited_reading import require_file
+from parkenv.errors import InputError, naming
+from parkenv.files.field_types import Name
+from parkenv.files.limited_reading import csv_records
+from parkenv.files.spec_file import Spec
 from parkenv.lots.draft import LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots
-from parkenv.lots.osm.rows import Side
+from parkenv.lots.osm.parking import (
+    ARRANGEMENTS,
+    SHORTEST_KERB_SLOT,
+    Area,
+    Junctions,
+    Kerb,
+    free_intervals,
+    kerb_of,
+    kerb_slots,
+)
+from parkenv.lots.osm.roads import SIDES, Rank, Road, Side, whole_number
+from parkenv.world.drive_graph import linestrings
 from parkenv.world.facility import Facility
 from parkenv.world.tariff import PUBLIC, Hours, Price, Zone, charge_in
 from parkenv.world.week import DAY_S, HOUR_S
@@ -61,7 +78,6 @@ class Rules:
     hours: str = ""  # when it is open, as OpenStreetMap writes it; empty: always
 
     def zone(self, kind: str) -> Zone:
-        """Return the zone of a kind of facility with these rules, named after them."""
         words = [kind]
         if self.users != PUBLIC:
             words.append(self.users)
@@ -75,8 +91,7 @@ class Rules:
             words.append(f"{self.max_stay_s / 60:g} min")
         words += [f"open {self.hours}"] if self.hours else []
         charged = Hours.parse(self.charged) if self.charged and self.per_hour else None
-        day = ((DAY_S, 24 * self.per_hour),) if self.by_day else ()
-        price = Price(self.per_hour, day, charged=charged)
+        price = Price(self.per_hour, ((DAY_S, 24 * self.per_hour),) if self.by_day else (), charged=charged)
         hours = Hours.parse(self.hours) if self.hours else None
         return Zone(" ".join(words), price, hours, self.max_stay_s, (self.users,))
 
@@ -86,7 +101,9 @@ def rules_of(tags: Mapping[str, str]) -> Rules:
     rules = _rules(
         users, tags.get("fee"), tags.get("charge"), tags.get("fee:conditional"), tags.get("maxstay")
     )
-    return replace(rules, hours=_open_hours(tags.get("opening_hours", "")))
+    # But for holidays.
+    hours = _shortest(re.sub(r"[;,]?\s*(PH|SH)\b[^;]*", "", tags.get("opening_hours", "")).strip("; "))
+    return rules if hours in (_shortest("24/7"), _shortest("off")) else replace(rules, hours=hours)
 
 
 def kerb_rules(tags: Mapping[str, str], side: Side) -> Rules:
@@ -126,13 +143,14 @@ def kerb_rules(tags: Mapping[str, str], side: Side) -> Rules:
 def _rules(
     users: str, fee: str | None, charge: str | None, conditional: str | None, maxstay: str | None
 ) -> Rules:
-    per_hour, assumed, charged, by_day = 0.0, False, "", False
+    per_hour, assumed, by_day = 0.0, False, False
     if charge is not None and (known := charge_in(charge)) is not None:
         per_hour, by_day = known
     elif (fee or "no").lower() not in ("no", "free", "unknown") or (conditional or "").startswith("yes"):
         per_hour, assumed = PRICE, True
-    if per_hour:
-        charged = _known_hours(fee) or _known_hours(conditional) or _known_hours(charge)
+    texts = (fee, conditional, charge) if per_hour else ()
+    readable = (_shortest("; ".join(_HOURS.findall(text or ""))) for text in texts)
+    charged = next(filter(None, readable), "").removesuffix("; Sa,Su off").removesuffix("; Su off")
     stay = None
     if maxstay is not None and (match := _STAY.search(maxstay)):
         seconds = float(match[1].replace(",", ".")) * (HOUR_S if match[2].lower().startswith("h") else 60.0)
@@ -142,43 +160,21 @@ def _rules(
     )
 
 
-def _open_hours(text: str) -> str:
-    """Return opening hours in their shortest form, but for holidays; empty if always, or if they cannot be read."""
+def _shortest(text: str) -> str:
+    """Return hours in their shortest form; empty if there are none that can be read."""
     try:
-        hours = Hours.parse(re.sub(r"[;,]?\s*(PH|SH)\b[^;]*", "", text).strip("; "))
+        return str(Hours.parse(text)) if text else ""
     except InputError:
         return ""
-    return "" if hours == Hours.parse("24/7") or not any(hours.days) else str(hours)
-
-
-def _known_hours(text: str | None) -> str:
-    """Return the hours within a text, in their shortest form; empty if there are none that can be read."""
-    found = "; ".join(_HOURS.findall(text or ""))
-    try:
-        return str(Hours.parse(found)).removesuffix("; Sa,Su off").removesuffix("; Su off") if found else ""
-    except InputError:
-        return ""
-
-
-def zones_of(used: Iterable[tuple[str, Rules]]) -> dict[str, Zone]:
-    zones = (rules.zone(kind) for kind, rules in dict.fromkeys(used))
-    return {zone.name: zone for zone in zones}
 
 
 class AreaRule(NamedTuple):
-    """Places by area: `places_of_square_metre` · (area · levels) ^ `power`.
+    """Places by area: `places_of_square_metre` · (area · levels) ^ `power`."""
 
-    Attributes:
-        places_of_square_metre: how many places an area of 1 m² had.
-        power: below 1 where large car parks need more ways.
-        levels: number of levels where the tags do not say it.
-        typical: places of one whose area is unknown.
-    """
-
-    places_of_square_metre: float
-    power: float
-    levels: float
-    typical: int
+    places_of_square_metre: float  # how many places an area of 1 m² had
+    power: float  # below 1 where large car parks need more ways
+    levels: float  # number of levels where the tags do not say it
+    typical: int  # places of one whose area is unknown
 
 
 RULES = {
@@ -198,7 +194,6 @@ GARAGES = ("underground", "multi-storey", "rooftop")  # rules of what is a garag
 
 
 def rule_of(tags: Mapping[str, str]) -> str:
-    """Return the name of the rule, a key of `RULES`, for a car park with these tags."""
     if "parking" not in tags and tags.get("building") == "parking":
         return "multi-storey"
     return KINDS.get(tags.get("parking", "surface"), "surface")
@@ -217,8 +212,7 @@ def expected_capacity(rule: str, area: float | None, levels: float | None) -> in
     a = RULES[rule]
     if area is None:
         return a.typical
-    expected = a.places_of_square_metre * float(area * (levels or a.levels)) ** a.power
-    return max(int(expected + 0.5), 1)
+    return max(int((a.places_of_square_metre * float(area * (levels or a.levels)) ** a.power) + 0.5), 1)
 
 
 GATE_S = 10.0  # s that the barrier of a garage takes for a car
@@ -287,86 +281,185 @@ SAME_NAME = 4.0  # so many times as far if they share a word that few of the lis
 _SIMILAR = 3.0  # largest ratio of the capacities of facilities that share no word
 
 
-class ListedCarPark(NamedTuple):
+class ListedCarPark(Spec):
     """A car park of a list: its capacity (0: not stated) and position, degrees."""
 
-    name: str
-    capacity: int
-    lat: float
-    lon: float
+    model_config = ConfigDict(extra="ignore", strict=False)
 
-
-def _name(text: str) -> str:
-    if not (0 < len(text) <= 80 and is_plain(text)):
-        raise ValueError(text)
-    return text
-
-
-def _capacity(text: str) -> int:
-    if len(text) > 6:
-        raise ValueError(text)
-    return int(WHOLE.parse(text or "0"))
-
-
-def _degrees(most: float) -> Kind:
-    def parse(text: str) -> float:
-        if not abs(float(text)) <= most:
-            raise ValueError(text)
-        return float(text)
-
-    return Kind(f"degrees from {-most:g} to {most:g}", parse)
-
-
-_COLUMNS = {
-    "name": Kind("a printable name of 1 to 80 letters", _name),
-    "capacity": Kind("a whole number of up to 6 digits, or nothing", _capacity),
-    "lat": _degrees(90.0),
-    "lon": _degrees(180.0),
-}
+    name: Annotated[Name, Field(min_length=1, max_length=80)]
+    capacity: Annotated[int, BeforeValidator(lambda text: text or 0), Field(ge=0, lt=1_000_000)]
+    lat: float = Field(ge=-90.0, le=90.0)
+    lon: float = Field(ge=-180.0, le=180.0)
 
 
 def read_listed(path: Path) -> list[ListedCarPark]:
     """Read a list of car parks, a CSV file with the columns name, capacity, lat and lon; others are not read."""
-    require_file(path)
-    found: dict[str, ListedCarPark] = {}
-    for line, row in typed_records(path, lambda name: _COLUMNS.get(name, TEXT)):
-        if missing := [name for name in _COLUMNS if name not in row]:
-            raise InputError(f"{path}: has no column {missing[0]}, want {','.join(_COLUMNS)}")
-        if row["name"] in found:
-            raise InputError(
-                f"{path}: line {line}: name is {row['name']!r:.40}, want one that no other line has"
-            )
-        found[row["name"]] = ListedCarPark(*(row[name] for name in _COLUMNS))
-    if not found:
+    listed: dict[str, ListedCarPark] = {}
+    for line, record in csv_records(path):
+        with naming(f"{path}: line {line}"):
+            car_park = ListedCarPark.parse(record, "")
+            if car_park.name in listed:
+                raise InputError(f"name is {car_park.name!r:.40}, want one that no other line has")
+            listed[car_park.name] = car_park
+    if not listed:
         raise InputError(f"{path}: has no car park, want a line for each")
-    return list(found.values())
+    return list(listed.values())
 
 
 def matched(
     listed: list[ListedCarPark], at: FloatArray, names: list[str], capacity: FloatArray, xy: FloatArray
 ) -> NDArray[np.int64]:
-    """Return which facility each car park of a list is, (k,) index, -1: none; each is at most one.
+    """Return which facility each car park of a list, at (k, 2) m, is: index or -1, each at most once; nearest in all.
 
-    It is one within `NEAR` of about the same capacity, or one whose name shares a word with it within `SAME_NAME` times
-    as far; words that many of the list have, such as *garage*, do not count. In all, distances are as small as can be.
-    The car parks are at `at`, (k, 2) m; facilities are entered at `xy`, (n, 2) m.
+    It is within `NEAR` and of like capacity, or shares a rare word with the name within `SAME_NAME` times as far.
     """
-    words = [set(_words(one.name)) for one in listed]
-    use = Counter(word for mine in words for word in mine)
-    rare = [{word for word in mine if use[word] <= max(len(listed) // 4, 1)} for mine in words]
-    shared = np.array([[bool(mine & set(_words(name))) for name in names] for mine in rare])
-    ratio = np.array([[max(one.capacity, 1)] for one in listed]) / np.maximum(capacity, 1.0)
+    words = [_words(car_park.name) for car_park in listed]
+    use = Counter(word for each in words for word in each)
+    rare = [{word for word in each if use[word] <= max(len(listed) // 4, 1)} for each in words]
+    shared = np.array([[bool(each & _words(name)) for name in names] for each in rare])
+    ratio = np.array([[max(car_park.capacity, 1)] for car_park in listed]) / np.maximum(capacity, 1.0)
     away = np.hypot(*(at[:, None] - xy).transpose(2, 0, 1))
     away = np.where(shared, away / SAME_NAME, away)
-    stated = np.array([[one.capacity > 0] for one in listed])
+    stated = np.array([[car_park.capacity > 0] for car_park in listed])
     unlike = ~shared & stated & (np.maximum(ratio, 1.0 / ratio) > _SIMILAR)
     cost = np.where((away > NEAR) | unlike, 2.0 * NEAR, away)
-    found = np.full(len(listed), -1)
-    for k, n in zip(*linear_sum_assignment(cost), strict=True):
-        if cost[k, n] <= NEAR:
-            found[k] = n
-    return found
+    facility = np.full(len(listed), -1)
+    pairs = np.array(linear_sum_assignment(cost))
+    k, n = pairs[:, cost[*pairs] <= NEAR]
+    facility[k] = n
+    return facility
 
 
-def _words(name: str) -> list[str]:
-    return [word for word in name.casefold().replace("-", " ").replace("/", " ").split() if len(word) > 1]
+def _words(name: str) -> set[str]:
+    return {word for word in name.casefold().replace("-", " ").replace("/", " ").split() if len(word) > 1}
+
+
+PLACES_PER_METRE = {
+    "residential": 0.1659,
+    "unclassified": 0.1539,
+    "living_street": 0.1499,
+    "tertiary": 0.0956,
+    "secondary": 0.0649,
+    "primary": 0.0153,
+}
+"""Places per metre of kerb, both sides, 5 m off the corners at junctions, by class of street.
+
+Fitted to the 43,863 places of Berlin-Neukölln by `python tests/parking_rules.py`, which says how well.
+"""
+METRES_PER_PLACE = {"parallel": 5.4, "diagonal": 3.1, "perpendicular": 2.6}
+"""Kerb taken by a place, m, by orientation; from the same kerbs."""
+STRIPS = ("street_side", "lane", "on_kerb", "half_on_kerb", "shoulder")
+"""Values of `parking` of areas that are kerbs."""
+CLASS_RULE = "class of street"  # name of the rule of kerbs that the map says nothing of
+HOUSES_WITHIN = 40.0  # m; where no building is this near, an untagged street has no places
+STATION = 20.0  # m, between the points of a street at which buildings are looked for
+STRIP_REACH = 20.0  # largest distance, m, of a drawn kerb from its street
+
+
+def kerb_sides(
+    roads: Sequence[Road],
+    crossings: FloatArray,
+    buildings: Sequence[Area],
+    left_out: Mapping[str, list[str]],
+    untagged: float = 1.0,
+) -> Iterator[FacilityRow]:
+    """Yield the kerbs of roads that have places, under the names of their streets; of a way there may be several."""
+    street = {k: i for i, k in enumerate(k for k, road in enumerate(roads) if road.rank is Rank.STREET)}
+    corners = Junctions([roads[k] for k in street], np.empty((0, 2)))
+    everything = Junctions(roads, crossings)
+    lonely = _without_houses(roads, buildings)
+    rest: dict[str, float] = defaultdict(float)  # fractions of places, by class, so that totals are kept
+    for k, road in enumerate(roads):
+        kind = road.tags["highway"]
+        total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
+        for side in SIDES:
+            tagged = road.side_of_way(side)
+            by_tag = any(
+                f"{key}:{at}" in road.tags for key in ("parking", "parking:lane") for at in (tagged, "both")
+            )
+            closed = everything.closed_intervals(k, side)
+            source, rule, capacity = "rule", CLASS_RULE, None
+            if by_tag:
+                usable = {key: value for key, value in road.tags.items() if value not in RESERVED}
+                kerb = kerb_of(usable, tagged)
+                if isinstance(kerb, str):
+                    left_out[kerb].append(f"{road.id}-{tagged}")
+                if kerb is None or isinstance(kerb, str):
+                    continue
+                capacity, source, rule = kerb.capacity, "tag", ""
+                if capacity is None:
+                    free = sum(end - start for start, end in free_intervals(total, closed))
+                    kerb = replace(kerb, capacity=int(free / METRES_PER_PLACE[kerb.orientation]))
+                    source, rule = "rule", "length of kerb"
+            else:
+                if (
+                    k not in street
+                    or any(road.tags.get(key, "no") != "no" for key in ("bridge", "tunnel", "junction"))
+                    or (side == "left" and _is_half(road))
+                ):
+                    continue
+                closed = closed + lonely[k]
+                off_corners = corners.closed_intervals(street[k], side) + lonely[k]
+                free = sum(end - start for start, end in free_intervals(total, off_corners))
+                free *= untagged * (2 if _is_half(road) else 1)
+                expected = PLACES_PER_METRE.get(kind, 0.0) * free + rest[kind]
+                rest[kind] = expected % 1.0
+                kerb = Kerb("parallel", int(expected), False)
+            slots = kerb_slots(road, side, kerb, closed)
+            if len(slots):
+                rules, name = kerb_rules(road.tags, tagged), road.tags.get("name", "")
+                yield FacilityRow(name, "kerb", rules, source, rule, f"{road.id} {tagged}", capacity, slots)
+
+
+def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> FacilityRow | None:
+    """Return the kerb that is drawn as an area, under its name; None if it is not along a road of the tree."""
+    tags = area.element.tags
+    (index, distance) = tree.query_nearest(area.polygon, return_distance=True, all_matches=False)
+    if not len(index) or distance[0] > STRIP_REACH:
+        return None
+    road = roads[int(index[0])]
+    line = linestrings([road.points])[0]
+    stations = shapely.line_locate_point(line, shapely.points(shapely.get_coordinates(area.polygon)))
+    start, end, total = float(stations.min()), float(stations.max()), float(shapely.length(line))
+    if end - start < SHORTEST_KERB_SLOT:
+        return None
+    orientation = tags.get("orientation", tags.get("parking:orientation", "parallel"))
+    orientation = orientation if orientation in ARRANGEMENTS else "parallel"
+    tagged = whole_number(tags.get("capacity"))
+    capacity = tagged if tagged is not None else max(round((end - start) / METRES_PER_PLACE[orientation]), 1)
+    middle = shapely.get_coordinates(shapely.centroid(area.polygon))[0]
+    here, ahead = shapely.get_coordinates(
+        shapely.line_interpolate_point(line, [(start + end) / 2 - 1.0, (start + end) / 2 + 1.0])
+    )
+    along, away = ahead - here, middle - here
+    side: Side = "left" if along[0] * away[1] - along[1] * away[0] > 0.0 else "right"
+    slots = kerb_slots(road, side, Kerb(orientation, capacity, False), [(-1.0, start), (end, total + 1.0)])
+    if not len(slots):
+        return None
+    source, rule = ("tag", "") if tagged is not None else ("rule", "length of kerb")
+    name = tags.get("name", road.tags.get("name", ""))
+    return FacilityRow(name, "kerb", rules_of(tags), source, rule, area.element.id, tagged, slots)
+
+
+def _is_half(road: Road) -> bool:
+    return road.oneway and road.tags["highway"] in ("primary", "secondary", "tertiary")
+
+
+def _without_houses(roads: Sequence[Road], buildings: Sequence[Area]) -> list[list[tuple[float, float]]]:
+    """Return the intervals of each road, m from its start, without a building beside it."""
+    if not buildings:
+        return [[] for _ in roads]
+    tree = shapely.STRtree([a.polygon for a in buildings])
+    lines = linestrings([road.points for road in roads])
+    total = shapely.length(lines)
+    count = np.maximum(np.ceil(total / STATION).astype(np.int64), 1)
+    of = np.repeat(np.arange(len(roads)), count)
+    rank = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    step = (total / count)[of]
+    at = shapely.line_interpolate_point(lines[of], (rank + 0.5) * step)
+    beside = np.zeros(len(of), bool)
+    beside[tree.query(at, predicate="dwithin", distance=HOUSES_WITHIN)[0]] = True
+    result: list[list[tuple[float, float]]] = [[] for _ in roads]
+    for i in np.flatnonzero(~beside).tolist():
+        result[of[i]].append((float(rank[i] * step[i]), float((rank[i] + 1) * step[i])))
+    return result

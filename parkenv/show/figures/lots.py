@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.draft import LotDraft
-from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.lots.generators import nearest_on_lanes
 from parkenv.lots.town.draft import TownDraft
 from parkenv.show.figures.charts import Panel, key_line
 from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
@@ -25,7 +25,6 @@ from parkenv.show.painters.axes import paint
 from parkenv.show.plurals import plural
 from parkenv.show.scene import (
     ARROWHEAD,
-    DISC,
     STAR,
     Areas,
     Layer,
@@ -101,7 +100,7 @@ def save_import_picture(draft: LotDraft, path: str | Path) -> None:
     colors = [SOURCE_COLORS[sources.index(source) % len(SOURCE_COLORS)] for source in draft.slot_source]
     entries, goals = draft.entries.reshape(-1, 2), draft.goals.reshape(-1, 2)
     parts = [corners.reshape(-1, 2), *(lane.points for lane in draft.lanes), entries, goals]
-    points = np.concatenate([*parts, *draft.outlines, draft.loose])
+    points = np.concatenate([*parts, *draft.outlines])
     if not len(points):
         points = np.zeros((1, 2))
     low, high = points.min(axis=0), points.max(axis=0)
@@ -117,7 +116,6 @@ def save_import_picture(draft: LotDraft, path: str | Path) -> None:
     layers = [
         Areas([[outline] for outline in draft.outlines], AREA, AREA_EDGE),
         *building_layers([wall for wall in draft.walls if is_building(wall)], draft.walls),
-        Marks(posed(draft.loose), DISC, SOURCE_COLORS[0], px=5.0),
         *_schematic(
             corners, colors, mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth), draft.lanes,
             entries, goals,

@@ -1,33 +1,47 @@
-"""Rows of slots along roads: kerbside parking from street tags, and parking areas filled by rule.
+"""The parking of a map: drawn spaces, areas filled by rule and kerbs; and buildings as goals and walls.
 
-Both tagging schemes are read: `parking:left|right|both` with `:orientation`, `:capacity`, `:restriction` and
+Both tagging schemes of kerbs are read: `parking:left|right|both` with `:orientation`, `:capacity`, `:restriction` and
 `:access`, and the deprecated `parking:lane:left|right|both` with `parking:condition:...`. Restrictions at
 certain hours (`:conditional`) are ignored. A capacity of `both` applies to each side.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.generators import BAY_SIZE, KERB_SIZE, NO_SLOTS, Slots
-from parkenv.lots.osm.roads import Rank, Road, metres, whole_number
+from parkenv.errors import InputError
+from parkenv.lots.generators import (
+    BAY_SIZE,
+    KERB_SIZE,
+    NO_SLOTS,
+    Slots,
+    nearest_on_lanes,
+    slots_from_polygons,
+)
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm.elements import OsmElement
+from parkenv.lots.osm.roads import (
+    SIDES,
+    Rank,
+    Road,
+    Side,
+    closed_to_cars,
+    metres,
+    off_the_ground,
+    whole_number,
+)
 from parkenv.world.drive_graph import SLOT_REACH, node_labels
-from parkenv.world.lot import Mouth
-
-Side = Literal["left", "right"]
+from parkenv.world.lot import Lane, Mouth
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Arrangement of parked cars along a road."""
-
     angle: float  # angle between the road and the cars, rad, from 0 (along it) to π/2 (across)
     length: float  # length of a slot, m
     width: float  # width of a slot, m
@@ -98,8 +112,7 @@ def bend_factor(points: FloatArray, start: float, end: float, side: Side, reach:
     stations = np.asarray(start + (np.arange(n) + 0.5) * step, dtype=np.float64)
     anchors = row_anchors(points, stations, step, side)
     beside = np.diff(anchors.xy + reach * anchors.outward, axis=0)
-    length = float(np.hypot(beside[:, 0], beside[:, 1]).sum())
-    return max(1.0, (end - start) * (n - 1) / n / max(length, 0.1))
+    return max(1.0, (end - start) * (n - 1) / n / max(float(np.hypot(beside[:, 0], beside[:, 1]).sum()), 0.1))
 
 
 def without_overlaps(boxes: NDArray[np.object_]) -> NDArray[np.bool_]:
@@ -176,16 +189,13 @@ def kerb_of(tags: Mapping[str, str], side: Side) -> Kerb | str | None:
 
 
 def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float, float]]) -> Slots:
-    """Create the slots along one side of a road, in the order of its points.
+    """Create the slots along one side of a road, in the order of its points, on the free intervals.
 
-    Cars face the direction of traffic, on the right. The number of slots is the tagged one, at most as many as fit at 5
-    m, or otherwise as many as fit at 6 m (2.5 m if cars park across the street). Slots are spread over the free
-    intervals; the closed ones are start and end in m from the road's start. A tagged `width` includes cars parked on
-    the carriageway.
+    As many as tagged, at most as fit at 5 m, or else as fit at 6 m (2.5 m across the street). A tagged `width` includes
+    cars parked on the carriageway.
     """
     how = ARRANGEMENTS[kerb.orientation]
-    total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
-    free = free_intervals(total, closed)
+    free = free_intervals(float(np.hypot(*np.diff(road.points, axis=0).T).sum()), closed)
     parallel = how.angle == 0.0
     least = SHORTEST_KERB_SLOT if parallel and kerb.capacity is not None else how.pitch
     depth = how.width if parallel else how.length * float(np.sin(how.angle))
@@ -200,15 +210,14 @@ def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float,
     )
     count = fit if kerb.capacity is None else _distribute(kerb.capacity, free, fit)
 
-    rows = []
+    rows = [NO_SLOTS]
     for (start, end), n, more in zip(free, count.tolist(), bend, strict=True):
         step = (end - start) / max(n, 1) if parallel else how.pitch * more
         middle, ranks = (start + end) / 2, np.arange(n) - (n - 1) / 2
         fitted = replace(how, length=min(how.length, step / more)) if parallel else how
         anchors = row_anchors(road.points, middle + ranks * step, fitted.pitch, side)
-        with_points = road.oneway or side == "right"
-        rows.append(row_at(anchors, offset, fitted, with_points=with_points))
-    return Slots.joined(rows) if rows else NO_SLOTS
+        rows.append(row_at(anchors, offset, fitted, with_points=road.oneway or side == "right"))
+    return Slots.joined(rows)
 
 
 def free_intervals(total: float, closed: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -230,8 +239,7 @@ def _distribute(
     length = np.array([end - start for start, end in free])
     for _ in range(min(capacity, int(fit.sum()))):
         # The next slot goes to the interval with the most room per slot.
-        room = np.where(count < fit, length / (count + 1), -1.0)
-        count[int(np.argmax(room))] += 1
+        count[int(np.argmax(np.where(count < fit, length / (count + 1), -1.0)))] += 1
     return count
 
 
@@ -240,8 +248,7 @@ class Junctions:
 
     def __init__(self, roads: Sequence[Road], crossings: FloatArray) -> None:
         self._roads = roads
-        xy = np.concatenate([road.points for road in roads] + [crossings])
-        label = node_labels(xy)
+        label = node_labels(np.concatenate([road.points for road in roads] + [crossings]))
         self._first = np.cumsum([0] + [len(road.points) for road in roads])
         self._label = label
         self._crossings = set(label[self._first[-1] :].tolist())
@@ -257,8 +264,7 @@ class Junctions:
     def closed_intervals(self, k: int, side: Side) -> list[tuple[float, float]]:
         """Return the intervals without parking on a side of road k, start and end in m from its start.
 
-        At junctions with streets, both sides stay free for 5 m beyond the corner and the cars parked around it; at
-        service roads, the side that they join; at pedestrian crossings, 5 m before and after.
+        At streets, both sides are free for 5 m beyond the corner and its parked cars; at service roads, their side.
         """
         points = self._roads[k].points
         stations = np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))].tolist()
@@ -299,12 +305,10 @@ def fill_outline(
     orientation: str | None,
     capacity: int | None,
 ) -> Slots:
-    """Fill an area with slots by rule: rows of 2.5 × 5 m along both sides of every aisle; none without a road nearby.
+    """Fill an area with rows of slots along both sides of the roads, clear of these and of blocked areas.
 
-    Cars park across the aisle unless an orientation, a key of `ARRANGEMENTS`, is given; if only slots of 6 × 2.1 m
-    along the aisle fit, cars park along it. Rows begin at the edge of the carriageway, or at the outline if the road
-    passes outside. A slot is inside the outline, clear of roads and blocked areas, and its mouth is nearest to its own
-    road. Rows with more slots are placed first; slots beyond the capacity are dropped from the end.
+    Cars park across the road unless an orientation is given or only slots along it fit. A slot's mouth is nearest
+    to its own road. Rows with more slots come first; those beyond the capacity are dropped.
     """
     if not roads:
         return NO_SLOTS
@@ -321,16 +325,14 @@ def fill_outline(
     rows: list[Slots] = []
     for k, road in enumerate(roads):
         for start, end in _intervals(lines[k], outline):
-            for side in ("left", "right"):
+            for side in SIDES:
                 tries = [
-                    _fitting(
-                        _row(road, side, start + phase * how.pitch, end, how, outline), roomy, taken, lines, k
-                    )
+                    _row(road, side, start + phase * how.pitch, end, how, outline)
                     for name, how in ARRANGEMENTS.items()
                     if name == orientation or (orientation is None and name != "diagonal")
                     for phase in PHASES
                 ]
-                rows.append(max(tries, key=len))
+                rows.append(max((_fitting(row, roomy, taken, lines, k) for row in tries), key=len))
     rows.sort(key=len, reverse=True)
     slots = Slots.joined(rows)
     slots = slots[without_overlaps(slots.boxes(shrink=0.02))]
@@ -358,8 +360,7 @@ def _row(
     hit = shapely.distance(shapely.points(anchors.xy), shapely.intersection(rays, outline))
     reached = np.isfinite(np.atleast_1d(hit))
     offset = np.maximum(np.where(reached, hit, 0.0), road.half_width)
-    with_points = road.oneway or side == "right"
-    return row_at(anchors, offset, how, with_points=with_points)[np.flatnonzero(reached)]
+    return row_at(anchors, offset, how, with_points=road.oneway or side == "right")[reached]
 
 
 def _fitting(
@@ -379,4 +380,205 @@ def _fitting(
         )
     )
     ahead = ((on_line - mouth) * slots.outward()).sum(axis=1) > 0.0
-    return slots[np.flatnonzero(fits & ahead)]
+    return slots[fits & ahead]
+
+
+ENTRANCE_REACH = 100.0  # largest distance, m, from the nearest slot of a building entrance that is a goal
+BUILDING_REACH = 200.0  # the same for the nearest building if there is no entrance
+NOT_GOALS = ("no", "garage", "emergency", "exit", "service")  # values of `entrance` that are not goals
+NOT_WALKED_TO = ("garage", "garages", "carport", "roof", "shed", "parking", "hut", "no", "transformer_tower")
+"""Values of `building` that are not goals."""
+
+
+@dataclass(frozen=True, eq=False)
+class Area:
+    """A closed element and its outline, m in the lot's frame."""
+
+    element: OsmElement
+    polygon: shapely.Geometry
+
+    @classmethod
+    def of(cls, element: OsmElement, frame: LocalFrame, *, simple: bool) -> Area:
+        """Return the area of a closed element; outlines that cross themselves are refused if `simple`, else mended."""
+        if not element.is_closed:
+            raise InputError(f"{element.id}: its outline is open, want its first position again at the end")
+        outer, holes = (
+            [shapely.Polygon(frame.to_xy(line)) for line in lines] for lines in (element.lines, element.holes)
+        )
+        for polygon in (*outer, *holes):
+            if simple and not element.cut and not polygon.is_valid:
+                reason = shapely.is_valid_reason(polygon).split("[")[0]
+                raise InputError(f"{element.id}: its outline is not a simple one: {reason}")
+        if element.tags.get("amenity") == "parking_space" and simple and len(outer) == 1 and not holes:
+            # The rectangle of a space depends on the corner that its outline begins at; a union would move it.
+            return cls(element, outer[0])
+        whole, gaps = (shapely.union_all(shapely.make_valid(part)) for part in (outer, holes))
+        shape = shapely.difference(whole, gaps)
+        parts = shapely.get_parts(shape)
+        areas = [part for part in parts if part.geom_type == "Polygon" and part.area > 0.0]
+        return cls(element, shape if len(areas) == len(parts) else shapely.union_all(areas))
+
+
+def areas_of(
+    elements: Sequence[OsmElement],
+    frame: LocalFrame,
+    wanted: Callable[[OsmElement], bool],
+    *,
+    mended: bool = False,
+) -> list[Area]:
+    """Return the areas of the closed ones among the wanted elements, `mended` also where spaces cross themselves."""
+    closed = (e for e in elements if wanted(e) and e.lines and e.is_closed and not e.is_node)
+    return [Area.of(e, frame, simple=not mended and e.tags.get("amenity") == "parking_space") for e in closed]
+
+
+def is_building(element: OsmElement) -> bool:
+    return element.tags.get("building", "no") != "no"
+
+
+def is_crossing(element: OsmElement) -> bool:
+    return element.tags.get("highway") == "crossing"
+
+
+def is_blind_end(element: OsmElement) -> bool:
+    tags = element.tags
+    return tags.get("noexit") == "yes" or tags.get("highway") in ("turning_circle", "turning_loop")
+
+
+def within(areas: Sequence[Area], box: tuple[float, float, float, float] | None) -> list[Area]:
+    if box is None:
+        return list(areas)
+    bounds = shapely.box(*box)
+    return [a for a in areas if shapely.contains(bounds, shapely.point_on_surface(a.polygon))]
+
+
+def exterior_rings(polygons: Iterable[shapely.Geometry]) -> list[FloatArray]:
+    rings = [shapely.get_exterior_ring(part) for whole in polygons for part in shapely.get_parts(whole)]
+    return [shapely.get_coordinates(ring) for ring in rings if ring is not None]
+
+
+def find_goals(
+    slots: Slots, nodes: Sequence[OsmElement], buildings: Sequence[Area], frame: LocalFrame
+) -> tuple[FloatArray, str | None]:
+    """Return entrances near the slots, main ones first, else the middle of the nearest building, (n, 2) m; a note."""
+    none = np.empty((0, 2))
+    if not len(slots):
+        return none, None
+    doors = [e for e in nodes if e.tags.get("entrance", "no") not in NOT_GOALS]
+    if doors:
+        xy = frame.to_xy(np.concatenate([e.lines[0] for e in doors]))
+        near = _distance_to_slots(slots, np.asarray(shapely.points(xy))) <= ENTRANCE_REACH
+        away = np.hypot(*(xy - slots.xy.mean(axis=0)).T)
+        is_side = np.array([e.tags["entrance"] != "main" for e in doors])
+        order = [int(i) for i in np.lexsort((away, is_side)) if near[i]]
+        if order:
+            return xy[order], "entrance " + ", ".join(doors[i].id for i in order[:5])
+    buildings = [a for a in buildings if a.element.tags["building"] not in NOT_WALKED_TO]
+    if buildings:
+        distance = _distance_to_slots(slots, np.array([a.polygon for a in buildings]))
+        k = int(np.argmin(distance))
+        if distance[k] <= BUILDING_REACH:
+            middle = shapely.get_coordinates(shapely.centroid(buildings[k].polygon))
+            return middle, f"the middle of the nearest building, {buildings[k].element.id}"
+    return none, None
+
+
+def split_walls(
+    slots: Slots, roads: Sequence[Road], buildings: Sequence[Area]
+) -> tuple[list[FloatArray], list[str]]:
+    """Return outlines, (k, 2) m each, of buildings near the slots, and ids of those that cars pass below."""
+    if not len(slots) or not buildings:
+        return [], []
+    polygons = np.array([a.polygon for a in buildings])
+    used = shapely.union_all(
+        [*slots.boxes(shrink=0.1), *(shapely.LineString(road.points).buffer(1.0) for road in roads)]
+    )
+    over = shapely.intersects(polygons, used)
+    near = (_distance_to_slots(slots, polygons) <= ENTRANCE_REACH) & ~over
+    return exterior_rings(polygons[near]), [buildings[k].element.id for k in np.flatnonzero(over).tolist()]
+
+
+def _distance_to_slots(slots: Slots, geometries: NDArray[np.object_]) -> FloatArray:
+    tree = shapely.STRtree(np.asarray(shapely.points(slots.xy)))
+    (index, _), distance = tree.query_nearest(geometries, all_matches=False, return_distance=True)
+    result = np.full(len(geometries), np.inf)
+    result[index] = distance
+    return result
+
+
+CAR_SPACES = ("normal", "yes", "car", "parent", "parents", "women", "woman", "customers", "residents")
+"""Values of `parking_space` that any car may use."""
+LARGEST_SPACE = 30.0
+"""Largest area of a slot, m²; a larger space without a capacity counts as several and is left out."""
+
+
+def is_space(element: OsmElement) -> bool:
+    return element.tags.get("amenity") == "parking_space" and not element.is_node
+
+
+def is_parking_area(element: OsmElement) -> bool:
+    return element.tags.get("amenity") == "parking"
+
+
+def usable_spaces(
+    spaces: Sequence[Area], parking: Sequence[Area]
+) -> tuple[list[Area], list[tuple[Area, str]]]:
+    private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
+    judged = [(a, _why_no_slot(a, private)) for a in spaces]
+    return [a for a, why in judged if why is None], [(a, why) for a, why in judged if why is not None]
+
+
+def _why_no_slot(space: Area, private: Sequence[shapely.Geometry]) -> str | None:
+    tags, kind = space.element.tags, space.element.tags.get("parking_space", "normal")
+    if space.element.cut:
+        return "spaces cut at the edge of the map"
+    disabled = tags.get("capacity:disabled", "no") not in ("no", "0")
+    if disabled or "disabled" in (kind, tags.get("access")):
+        return "spaces for disabled drivers"
+    if kind not in CAR_SPACES:
+        return f"spaces with parking_space={kind}"
+    if reason := closed_to_cars(tags) or off_the_ground(tags):
+        return f"spaces with {reason}"
+    inside = shapely.point_on_surface(space.polygon)
+    if any(shapely.contains(other, inside) for other in private):
+        return "spaces in private parking"
+    if not whole_number(tags.get("capacity")) and float(shapely.area(space.polygon)) > LARGEST_SPACE:
+        return f"spaces larger than {LARGEST_SPACE:g} m² without a capacity"
+    return None
+
+
+def slots_by_rank(
+    polygons: NDArray[np.object_], roads: Sequence[Road]
+) -> Iterator[tuple[Rank, NDArray[np.intp], Slots]]:
+    """Yield slots by the rank of the road that they open to, with their indices; lower ranks win, even if farther."""
+    left = np.arange(len(polygons))
+    for rank in Rank:
+        near = [Lane(road.points, road.oneway) for road in roads if road.rank <= rank]
+        if not len(left) or not near:
+            continue
+        slots = slots_from_polygons(polygons[left], near)
+        to_lane = nearest_on_lanes(near, slots.mouths())[0] - slots.mouths()
+        reached = np.hypot(to_lane[:, 0], to_lane[:, 1]) <= SLOT_REACH
+        yield rank, left[reached], slots[reached]
+        left = left[~reached]
+
+
+def split_space(
+    element: OsmElement, polygon: shapely.Geometry, lanes: Sequence[Lane]
+) -> list[tuple[str, shapely.Geometry]]:
+    """Split a space into as many as its capacity, along its nearest lane or else its longer side, and name them."""
+    count = whole_number(element.tags.get("capacity")) or 1
+    if count == 1:
+        return [(element.id, polygon)]
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(polygon))[:4]
+    one, other = corners[1] - corners[0], corners[3] - corners[0]
+    along = nearest_on_lanes(lanes, corners.mean(axis=0)[None])[1][0]
+    share = (
+        [abs(side @ along) / np.hypot(*side) for side in (one, other)] if lanes else np.hypot(*[one, other])
+    )
+    if share[1] > share[0]:
+        one, other = other, one
+    starts = corners[0] + np.arange(count)[:, None] / count * one
+    return [
+        (f"{element.id}-{k}", shapely.Polygon([p, p + one / count, p + one / count + other, p + other]))
+        for k, p in enumerate(starts, start=1)
+    ]
