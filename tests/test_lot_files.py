@@ -15,7 +15,7 @@ from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.files.file_names import is_plain
 from parkenv.files.known_names import PACKAGED_LOTS
-from parkenv.lots import city_lot, grid_lot, import_lot, packaged_lot, read_lot, write_lot
+from parkenv.lots import grid_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import check_lot
@@ -110,13 +110,6 @@ def test_written_lots_are_read_back_to_the_bit(
     assert again == lot
     assert again.slot_xy.tobytes() == lot.slot_xy.tobytes()
     assert again.edge_length.tobytes() == lot.edge_length.tobytes()
-
-
-def test_a_city_is_read_back_to_the_bit(tmp_path):
-    lot = city_lot(200, 1)
-    write_lot(lot, tmp_path / "city.json")
-    assert read_lot(tmp_path / "city.json") == lot
-    assert check_lot(tmp_path / "city.json") == []
 
 
 def test_parking_costs_need_no_exact_shape_and_stand_with_their_slot(tmp_path):

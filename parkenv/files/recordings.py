@@ -151,7 +151,6 @@ def _unpacked(make: Callable[[], Any], data: bytes, most: int = MAX_PART_BYTES) 
 
 
 def _require_few_overlaps(path: Path, chunks: Any) -> None:
-    """Check that chunks of an MCAP file that overlap in time, of which the library holds all, fit into memory."""
     if len({chunk.chunk_start_offset for chunk in chunks}) < len(chunks):
         raise InputError(f"{path}: lists a chunk twice")
     changes = [(chunk.message_start_time, chunk.uncompressed_size) for chunk in chunks]

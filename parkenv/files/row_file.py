@@ -103,7 +103,6 @@ class RowFile:
             return self._db.execute(query, (name, to_json(key))).fetchone() is not None
 
     def read(self, name: str) -> Iterator[Row]:
-        """Yield the rows of a name, in the order in which they were written."""
         with self._errors_in_words():
             query = "SELECT value, crc32 FROM row WHERE name = ? ORDER BY rowid"
             for text, check in self._db.execute(query, (name,)):

@@ -56,7 +56,6 @@ class Provenance:
 
 
 def combined_error_probability(issues: tuple[QualityIssue, ...]) -> float:
-    """Return the probability, 0 to 1, that a lot is wrong, if its issues are independent."""
     return 1.0 - math.prod(1.0 - min(max(issue.error_probability, 0.0), 1.0) for issue in issues)
 
 

@@ -1,8 +1,8 @@
 """Recognise, read, import and check lot files, and read the packaged lots."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from enum import Enum
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,41 +24,28 @@ from parkenv.lots.osm.elements import holds_osm
 from parkenv.world.drive_graph import GraphError, node_labels
 from parkenv.world.lot import Lane, ParkingLot
 
-
-class LotFormat(Enum):
-    """Format of a file that a lot is read or imported from."""
-
-    GEOJSON = "native GeoJSON"
-    DRAGON_LAKE = "Dragon Lake map"
-    OSM = "OpenStreetMap"
-    SLOT_LIST = "list of slot centres"
-
-    @property
-    def is_complete(self) -> bool:
-        return self in (LotFormat.GEOJSON, LotFormat.DRAGON_LAKE)
+FORMATS = {
+    **dict.fromkeys((".yml", ".yaml"), "dragon-lake"),
+    **dict.fromkeys((".osm", ".xml", ".pbf"), "osm"),
+    ".csv": "slots",
+}
+WHOLE = (
+    "native",
+    "dragon-lake",
+)  # formats that define a whole lot; of others, `import_lot` derives one by rules
 
 
-def lot_format(path: Path) -> LotFormat | None:
+def lot_format(path: Path) -> str | None:
     """Return a file's format by its suffix and, for JSON, its content; None for an unknown suffix. Does not raise.
 
     A JSON file that cannot be read counts as native: its reader then reports the error.
     """
     suffix = unpacked_path(path).suffix.lower()
     if suffix in (".json", ".geojson"):
-        try:
-            is_osm = holds_osm(read_json(path))
-        except InputError:
-            is_osm = False
-        return LotFormat.OSM if is_osm else LotFormat.GEOJSON
-    by_suffix = {
-        ".yml": LotFormat.DRAGON_LAKE,
-        ".yaml": LotFormat.DRAGON_LAKE,
-        ".osm": LotFormat.OSM,
-        ".xml": LotFormat.OSM,
-        ".pbf": LotFormat.OSM,
-        ".csv": LotFormat.SLOT_LIST,
-    }
-    return by_suffix.get(suffix)
+        with suppress(InputError):
+            return "osm" if holds_osm(read_json(path)) else "native"
+        return "native"
+    return FORMATS.get(suffix)
 
 
 def load_lot(name_or_path: str | Path) -> ParkingLot:
@@ -103,7 +90,7 @@ def read_lot(path: str | Path) -> ParkingLot:
 
 def _read_whole(path: Path) -> tuple[ParkingLot, str]:
     file_format = lot_format(path)
-    if file_format is LotFormat.DRAGON_LAKE:
+    if file_format == "dragon-lake":
         return dragon_lake_lot(path), ""
     contents = read_contents(path)
     if not contents.errors:
@@ -113,7 +100,7 @@ def _read_whole(path: Path) -> tuple[ParkingLot, str]:
             pass
     errors = [*contents.errors, *graph_errors(contents)]
     first = str(errors[0]).removeprefix("error: ")
-    if file_format is not None and not file_format.is_complete:
+    if file_format is not None and file_format not in WHOLE:
         raise InputError(f"{path}: {first}; `parkenv lot import {path}` makes a lot of it")
     more = f" (and {len(errors) - 1} more; `parkenv lot check {path}` lists all)" if len(errors) > 1 else ""
     raise InputError(f"{path}: {first}{more}")
@@ -141,11 +128,11 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
     options = options or ImportOptions()
     file_format = lot_format(path)
     # What infers a lot takes longer to load than a search in a finished one.
-    if file_format is LotFormat.OSM:
+    if file_format == "osm":
         from parkenv.lots.osm.draft import osm_draft
 
         return osm_draft(path, options)
-    if file_format is LotFormat.SLOT_LIST:
+    if file_format == "slots":
         from parkenv.lots.formats.slot_list import slot_list_draft
 
         return slot_list_draft(path, options)
@@ -274,9 +261,9 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     """
     path = Path(path)
     file_format = lot_format(path)
-    if file_format is not None and not file_format.is_complete:
+    if file_format is not None and file_format not in WHOLE:
         return _import_problems(path)
-    if file_format is LotFormat.DRAGON_LAKE:
+    if file_format == "dragon-lake":
         try:
             dragon_lake_lot(path)
         except InputError as error:

@@ -25,7 +25,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError, nearest
-from parkenv.files.field_types import Probability
+from parkenv.files.field_types import Name, Probability
 from parkenv.files.known_names import (
     DETECTORS,
     LOT_SUFFIXES,
@@ -186,10 +186,6 @@ def _occupancy_table(text: str) -> dict[str, Any]:
     )
 
 
-def _several(value: object) -> object:
-    return value.split(",") if isinstance(value, str) else value
-
-
 def _mapping(value: object, info: ValidationInfo) -> object:
     return value if value == SAME_SLOTS else resolved_path(value, info)
 
@@ -225,17 +221,23 @@ class CountsSpec(_Popularity):
     timezone: str = Field("Europe/Berlin", description="Local time zone, for `hour_utc` and `time_utc`.")
 
 
+_Logs = Annotated[
+    Several[FilePath],
+    BeforeValidator(lambda value: value.split(",") if isinstance(value, str) else value),
+    Field(min_length=1),
+    OrText(),
+]
+
+
 class OccupancySpec(Spec):
     """When slots are taken: a typical week by default."""
 
     typical: TypicalWeek | None = None
     real_week: RealWeek | None = None
     process: FilePath | None = Field(None, description="Rates from `parkenv occupancy fit` (.json).")
-    log: Annotated[Several[FilePath], BeforeValidator(_several), Field(min_length=1), OrText()] | None = (
-        Field(
-            None,
-            description="A recorded log (.csv, .csv.gz), or several of the same slots, replayed day by day.",
-        )
+    log: _Logs | None = Field(
+        None,
+        description="A recorded log (.csv, .csv.gz), or several of the same slots, replayed day by day.",
     )
     counts: CountsSpec | None = None
     car_parks: Several[str] | None = option(
@@ -399,10 +401,6 @@ class Speeds(Spec):
 MAX_PRICE = 1e6  # highest price per hour
 
 
-def _per_hour(text: str) -> float:
-    return Price.parse(text).per_hour
-
-
 def _price(text: str) -> tuple[str, object]:
     """Parse ZONE=AMOUNT/h, ZONE=+AMOUNT/h, or ZONE=AMOUNT@HOURS;AMOUNT@HOURS."""
     zone, equals, amount = text.rpartition("=")
@@ -415,7 +413,6 @@ def _price(text: str) -> tuple[str, object]:
 
 
 def _amount(value: object) -> object:
-    """Check a price, a text such as +1 for one that is added, or prices by hours."""
     per_hour = math.inf
     if isinstance(value, int | float | str):
         with contextlib.suppress(InputError):
@@ -463,7 +460,7 @@ class Costs(Spec):
         "Value of an hour of the driver's time, in the same currency; converts payments to time.",
         takes="AMOUNT/h",
         panel="Prices",
-        parse=_per_hour,
+        parse=lambda text: Price.parse(text).per_hour,
         default=f"the scenario's, {VALUE_OF_TIME:g}",
         gt=0.0,
         le=1e6,
@@ -532,10 +529,6 @@ def _goal(value: object) -> object:
     raise ValueError("the index of one of the lot's goals, or a point [x, y] in m")
 
 
-def _goal_text(text: str) -> object:
-    return int(text) if text.isdecimal() else numbers_in(text, 2)
-
-
 def _name(value: str) -> str:
     if len(value) > 80 or not value.isprintable() or set(value) & set("/\\,"):
         raise ValueError("at most 80 printable characters without comma or slash")
@@ -554,13 +547,7 @@ Rates = Annotated[
 Weights = Several[Annotated[float, Field(ge=0.0, le=1e12)]]
 
 
-def _purpose(value: str) -> str:
-    if not 0 < len(value) <= 80 or not value.isprintable():
-        raise ValueError("a name of 1 to 80 printable characters")
-    return value
-
-
-PurposeName = Annotated[str, AfterValidator(_purpose)]
+PurposeName = Annotated[Name, Field(min_length=1, max_length=80)]
 
 
 class PurposeSpec(Spec):
@@ -668,7 +655,7 @@ class ScenarioSpec(Spec):
         "Walk to this point, m, or to the lot's goal of this index.",
         takes="X,Y",
         panel="World",
-        parse=_goal_text,
+        parse=lambda text: int(text) if text.isdecimal() else numbers_in(text, 2),
         default="the scenario's",
     )
     entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
@@ -758,7 +745,6 @@ class ScenarioSpec(Spec):
 
     @property
     def argument(self) -> str:
-        """The file that the scenario was read from, or its name, as `--scenario` takes it."""
         return self._file or self.title
 
 

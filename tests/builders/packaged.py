@@ -60,12 +60,7 @@ def lot(name, rows, lanes, entries, goals, walls, turned=0.0):
 
 
 def campus():
-    """Create a wide lot with double rows, modelled on the Freiburg campus (T Fig. 4.5).
-
-    Three aisles connect a straight road in the west and a slanting one in the east, with a passage half-way and
-    planted islands. The northern aisle is one-way eastward with angled slots on its north side. Cars enter from the
-    west; the goal is the door of the building in the east.
-    """
+    """A wide lot with double rows, modelled on the Freiburg campus (T Fig. 4.5); the northern aisle is one-way."""
     two_way = False
     south, middle, north = 0.0, 16.0, 32.0
     passage = 48.5
@@ -104,11 +99,7 @@ def campus():
 
 
 def jam():
-    """Create a lot on a site that narrows to the north (after T Fig. 4.10), rotated by 11° like its street.
-
-    There are four aisles of unequal length; the northern one is a dead end. Cars enter from the west at the second
-    aisle; the goal is beyond the eastern road.
-    """
+    """A lot on a site that narrows to the north (after T Fig. 4.10), rotated by 11° like its street."""
     half = AISLE / 2
     y = [0.0, 16.0, 32.0, 48.0]
     west = [0.0, 7.0, 14.0]
@@ -139,11 +130,7 @@ def jam():
 
 
 def street():
-    """Create kerbside slots around six city blocks; three of the seven streets are one-way.
-
-    Cars enter from the west and from the east. Houses line the streets around courtyards with one driveway each, whose
-    kerb is kept clear; trees replace some more slots. The goal is a door in a courtyard.
-    """
+    """Kerbside slots around six city blocks with courtyards; three of the seven streets are one-way."""
     rows = (
         [(0.0, 0.0), (64.0, -3.0), (131.0, -4.0), (190.0, 0.0)],
         [(2.0, 55.0), (62.0, 53.0), (133.0, 56.0), (193.0, 58.0)],
@@ -177,7 +164,7 @@ def street():
 
 
 def mini():
-    """Create ten slots on one aisle; cars enter from the west, the goal is in the east."""
+    """Ten slots on one aisle."""
     rows = [row("A", (15.0, -AISLE / 2), WEST, 6), row("B", (2.5, AISLE / 2), EAST, 2, -1, 2)]
     walls = [[(-1.0, -8.6), (16.0, -8.6)], rectangle(21.0, -7.0, 29.0, -2.0)]
     return lot("mini", rows, [([(-9.0, 0.0), (17.0, 0.0)], False)], [(-9.0, 0.0)], [(25.0, 0.0)], walls)

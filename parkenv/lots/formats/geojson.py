@@ -345,7 +345,6 @@ class Positions:
         return self.frame is not None or self._grid is not None
 
     def to_lonlat(self, points: FloatArray) -> FloatArray:
-        """Convert the file's positions, (n, 2), to longitude and latitude, degrees; of metres around (0, 0)."""
         if self.frame is not None:
             return self.frame.to_lonlat(points)
         if self._grid is None or not len(points):

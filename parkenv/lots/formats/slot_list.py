@@ -37,11 +37,6 @@ class SlotList:
     zone: NDArray[np.str_]  # (n_slots,) tariff zones; empty texts for none
     frame: LocalFrame | None  # geographic frame of the lot; None for a file in metres
 
-    def subset(self, index: IntArray) -> SlotList:
-        ids = tuple(self.ids[i] for i in index.tolist())
-        yaw = None if self.yaw is None else self.yaw[index]
-        return SlotList(ids, self.xy[index], yaw, self.parking_cost_s[index], self.zone[index], self.frame)
-
 
 Metres = Annotated[float, Field(ge=-1e8, le=1e8)]
 
@@ -108,7 +103,10 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
         inside = np.asarray(((listed.xy >= box[:2]) & (listed.xy <= box[2:])).all(axis=1))
         if not inside.any():
             raise InputError(f"{path}: no slot within the bounds {', '.join(f'{b:g}' for b in box)} m")
-        listed = listed.subset(np.flatnonzero(inside))
+        ids = tuple(name for name, is_inside in zip(listed.ids, inside.tolist(), strict=True) if is_inside)
+        columns = ("xy", "yaw", "parking_cost_s", "zone")
+        some = {name: values[inside] for name in columns if (values := getattr(listed, name)) is not None}
+        listed = replace(listed, ids=ids, **some)
     entries, goals = (points_in_frame(listed.frame, given) for given in (options.entries, options.goals))
     with naming(path):
         spaces, index = spaces_from_centers(listed.ids, listed.xy, listed.yaw)

@@ -329,7 +329,6 @@ def _faced(rows: Sequence[OpenRow], owner: IntArray, r: int) -> IntArray:
 
 
 def _depth(part: OpenRow, is_faced: NDArray[np.bool_]) -> FloatArray:
-    """Return the distances, (k,) m, from the mouths of a row to its centre line."""
     clear = part.view.clear
     depth = np.minimum(clear / 2, HALF_WIDTH if part.row.slant > np.radians(70.0) else NARROW_HALF_WIDTH)
     if is_faced.any():
@@ -496,7 +495,6 @@ def _clear_parts(points: FloatArray, tree: shapely.STRtree) -> list[FloatArray]:
 
 
 def _extended(aisles: Sequence[Aisle], tree: shapely.STRtree) -> list[Aisle]:
-    """Continue every aisle straight on beyond its ends: to an aisle that it meets, or as far as cars turn."""
     lines = np.array([aisle.line for aisle in aisles])
     crossing = shapely.STRtree(lines)
     extended = []

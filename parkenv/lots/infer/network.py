@@ -36,7 +36,6 @@ class Line:
 
 
 def noded(lines: Sequence[Line]) -> list[Line]:
-    """Cut lines where they cross or touch, and move loose ends onto the lines beside them."""
     points = _joined_ends([np.round(line.points / GRID) * GRID for line in lines])
     lines = [line for line, part in zip(lines, points, strict=True) if len(part) > 1]
     original = np.array([shapely.LineString(part) for part in points if len(part) > 1])
@@ -105,7 +104,6 @@ def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
 
 
 def without_stubs(lines: Sequence[Line], count_served: Callable[[Sequence[Line]], int]) -> list[Line]:
-    """Drop short dead ends, the shortest first, unless fewer spaces have a lane before them without it."""
     kept = list(lines)
     served = count_served(kept)
     needed: set[int] = set()

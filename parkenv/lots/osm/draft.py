@@ -164,7 +164,6 @@ class MapImport:
     def drawn_slots(
         self, spaces: Sequence[Area], lanes: Sequence[Lane], roads: Sequence[Road]
     ) -> tuple[list[_Part], list[tuple[Rank, NDArray[np.intp], Slots]]]:
-        """Return the parts of drawn spaces, and by the rank of the road that they open to, their indices and slots."""
         parts = [
             _Part(area, name, polygon)
             for area in spaces

@@ -426,7 +426,6 @@ def areas_of(
     *,
     mended: bool = False,
 ) -> list[Area]:
-    """Return the areas of the closed ones among the wanted elements, `mended` also where spaces cross themselves."""
     closed = (e for e in elements if wanted(e) and e.lines and e.is_closed and not e.is_node)
     return [Area.of(e, frame, simple=not mended and e.tags.get("amenity") == "parking_space") for e in closed]
 

@@ -289,7 +289,6 @@ def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road
 
 
 def street_junctions(roads: Sequence[Road], streets: Sequence[Road]) -> FloatArray:
-    """Return the nodes that a road shares with a street, where cars turn in, (n, 2) m."""
     along = _road_nodes([*roads, *streets])
     public = {label for labels in along[len(roads) :] for label in labels.tolist()}
     shared: dict[int, FloatArray] = {}

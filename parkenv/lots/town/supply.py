@@ -208,7 +208,6 @@ def levels_of(tags: Mapping[str, str]) -> float | None:
 
 
 def expected_capacity(rule: str, area: float | None, levels: float | None) -> int:
-    """Return the number of places by a rule of `RULES`, at least 1; the area (of a level, m²) may be unknown."""
     a = RULES[rule]
     if area is None:
         return a.typical
@@ -446,7 +445,6 @@ def _is_half(road: Road) -> bool:
 
 
 def _without_houses(roads: Sequence[Road], buildings: Sequence[Area]) -> list[list[tuple[float, float]]]:
-    """Return the intervals of each road, m from its start, without a building beside it."""
     if not buildings:
         return [[] for _ in roads]
     tree = shapely.STRtree([a.polygon for a in buildings])

@@ -11,7 +11,7 @@ from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import LocaliserName
 from parkenv.lots.formats.geojson import read_contents
-from parkenv.lots.lot_files import LotFormat, lot_format
+from parkenv.lots.lot_files import lot_format
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.inference import predict
 from parkenv.mapping.photo_options import PhotoOptions
@@ -56,7 +56,7 @@ def add_recording(
     progress("Reading", 0, 0)
     photos, taken = photos or PhotoOptions(), None
     if is_photographs(recording):
-        is_geographic = lot_file is not None and lot_format(lot_file) is LotFormat.GEOJSON
+        is_geographic = lot_file is not None and lot_format(lot_file) == "native"
         frame = read_contents(lot_file).frame if lot_file is not None and is_geographic else None
         taken = Photographs(recording, photos, calibration, frame)
     elif photos != PhotoOptions():
