@@ -1,14 +1,12 @@
 """Read videos frame by frame, and write films."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -34,8 +32,6 @@ class VideoFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Video:
-    """A video file."""
-
     path: Path
     width: int  # px
     height: int
@@ -51,7 +47,7 @@ class Video:
         return self.path
 
     @classmethod
-    def of(cls, path: Path) -> Video:
+    def of(cls, path: Path) -> Self:
         with _opened(path) as capture:
             there, first = capture.read()
             if not there or first is None:

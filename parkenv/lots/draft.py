@@ -1,12 +1,10 @@
 """Options and result of an import: a lot, or an incomplete lot with a list of what is missing, guessed or doubtful."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -25,8 +23,6 @@ from parkenv.world.tariff import Zone
 
 @dataclass(frozen=True)
 class QualityIssue:
-    """A reason why a lot may differ from the place."""
-
     reason: str
     error_probability: float  # that it makes the lot wrong, 0 to 1
 
@@ -128,7 +124,7 @@ class LeftOut:
     ids: tuple[str, ...]
 
     @classmethod
-    def by_reason(cls, listed: Mapping[str, Iterable[str]]) -> tuple[LeftOut, ...]:
+    def by_reason(cls, listed: Mapping[str, Iterable[str]]) -> tuple[Self, ...]:
         return tuple(cls(reason, tuple(ids)) for reason, ids in listed.items() if ids)
 
     def __str__(self) -> str:
@@ -163,7 +159,7 @@ class LotDraft:
     left_hand: bool = False  # whether cars keep to the left
 
     @classmethod
-    def of_lot(cls, lot: ParkingLot) -> LotDraft:
+    def of_lot(cls, lot: ParkingLot) -> Self:
         return cls(
             **{name: getattr(lot, name) for name in _SHARED},
             slots=Slots.of_lot(lot),
@@ -184,7 +180,7 @@ class LotDraft:
             raise InputError("; ".join(self.missing))
         return ParkingLot(**{name: getattr(self, name) for name in _SHARED}, **self.slots.columns())
 
-    def searchable(self) -> LotDraft:
+    def searchable(self) -> Self:
         """Return the draft without slots and facilities that no entry leads to; an incomplete one unchanged."""
         try:
             lot = self._lot()
@@ -203,7 +199,7 @@ class LotDraft:
         ids = tuple(self.slot_ids[i] for i in np.flatnonzero(lost))
         return self._without(lost, LeftOut("slots that cannot be reached from an entry", ids))
 
-    def in_left_hand_traffic(self) -> LotDraft:
+    def in_left_hand_traffic(self) -> Self:
         """Return the draft where cars keep to the left, and those parked along a lane head the way of its traffic."""
         draft = replace(self, left_hand=True)
         try:
@@ -216,7 +212,7 @@ class LotDraft:
         mouth = np.where(turned, Mouth.LEFT + Mouth.RIGHT - slots.mouth, slots.mouth).astype(np.int8)
         return replace(draft, slots=replace(slots, yaw=slots.yaw + np.pi * turned, mouth=mouth))
 
-    def _without(self, lost: BoolArray, left_out: LeftOut) -> LotDraft:
+    def _without(self, lost: BoolArray, left_out: LeftOut) -> Self:
         kept = np.flatnonzero(~lost)
         slots = self.slots[kept]
         named = set(slots.facility.tolist())

@@ -1,7 +1,5 @@
 """Slots: their columns, rows of them, generated lots (a grid, a city), and their shapes from polygons and lanes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from itertools import count
@@ -50,15 +48,15 @@ class Slots:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def __getitem__(self, index: NDArray[np.intp] | BoolArray | slice) -> Slots:
-        return Slots(*(getattr(self, f.name)[index] for f in fields(self)))
+    def __getitem__(self, index: NDArray[np.intp] | BoolArray | slice) -> Self:
+        return type(self)(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @classmethod
     def of_lot(cls, lot: ParkingLot) -> Self:
         return cls(*(getattr(lot, f"slot_{f.name}") for f in fields(cls)))
 
     @classmethod
-    def joined(cls, parts: Sequence[Slots]) -> Self:
+    def joined(cls, parts: Sequence[Self]) -> Self:
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def columns(self) -> dict[str, Any]:
@@ -205,7 +203,14 @@ def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
     require_whole("city: n_slots", n_slots, least=1)
     # A block has about 45 slots: add rows of blocks until all slots fit.
     for n_blocks in count(max(1, int(np.sqrt(n_slots / 48)))):
-        streets = _random_streets(n_blocks, np.random.default_rng([seed, n_blocks]))
+        # Blocks of 60-140 m × 50-110 m; two in five streets are one-way.
+        rng = np.random.default_rng([seed, n_blocks])
+        x = np.cumsum(rng.uniform(60.0, 140.0, n_blocks + 1))
+        y = np.cumsum(rng.uniform(50.0, 110.0, n_blocks + 1))
+        shift = rng.uniform(-6.0, 6.0, (n_blocks + 1, n_blocks + 1, 2))
+        oneway = rng.choice([-1, 0, 0, 0, 1], size=(2, n_blocks + 1))
+        oneway[:, [0, -1]] = 0
+        streets = StreetGrid(np.stack(np.meshgrid(x, y), axis=-1) + shift, along=oneway[0], across=oneway[1])
         slots = streets.kerb_slots()
         if len(slots) >= n_slots:
             break
@@ -227,15 +232,6 @@ def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
         goals=corners[middle].mean(axis=0)[None],
         walls=tuple(outlines(corners[built], BUILDING_SETBACK)),
     )
-
-
-def _random_streets(n_blocks: int, rng: np.random.Generator) -> StreetGrid:
-    x = np.cumsum(rng.uniform(60.0, 140.0, n_blocks + 1))
-    y = np.cumsum(rng.uniform(50.0, 110.0, n_blocks + 1))
-    crossings = np.stack(np.meshgrid(x, y), axis=-1) + rng.uniform(-6.0, 6.0, (n_blocks + 1, n_blocks + 1, 2))
-    oneway = rng.choice([-1, 0, 0, 0, 1], size=(2, n_blocks + 1))
-    oneway[:, [0, -1]] = 0
-    return StreetGrid(crossings, along=oneway[0], across=oneway[1])
 
 
 @dataclass(frozen=True, eq=False)

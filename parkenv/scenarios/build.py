@@ -134,9 +134,7 @@ def require_changes(owners: Sequence[type], changes: Iterable[str], *others: str
 
 
 def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec]:
-    slots = [_lot(spec.lot).n_slots for spec in specs]
-    order = sorted(range(len(specs)), key=lambda i: -slots[i])
-    return [specs[i] for i in order[:count]]
+    return sorted(specs, key=lambda spec: -_lot(spec.lot).n_slots)[:count]
 
 
 def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:

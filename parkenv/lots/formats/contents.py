@@ -196,13 +196,9 @@ def read_zones(document: Any) -> dict[str, Zone]:
 
 
 def zone_document(zone: Zone) -> dict[str, Any]:
-    price = zone.price.members()
-    document: dict[str, Any] = {"price": price} if price else {}
-    if zone.hours is not None:
-        document["hours"] = str(zone.hours)
-    if zone.max_stay_s is not None:
-        document["max_stay_s"] = zone.max_stay_s
-    return document | {"users": list(zone.users)}
+    hours = None if zone.hours is None else str(zone.hours)
+    rules = {"price": zone.price.members() or None, "hours": hours, "max_stay_s": zone.max_stay_s}
+    return {name: rule for name, rule in rules.items() if rule is not None} | {"users": list(zone.users)}
 
 
 def read_zone(properties: dict[str, Any], rules: Collection[str]) -> str:

@@ -333,23 +333,18 @@ _ADVICE = (
 class Positions:
     """What a file's pairs of numbers are."""
 
-    in_metres: bool = (
-        False  # east and north in a frame of the file's own; else `to_lonlat` converts them to degrees
-    )
+    # east and north in a frame of the file's own; else `to_lonlat` converts them to degrees
+    in_metres: bool = False
     found: str = ""  # which map grid they are in, one line; else empty
     frame: LocalFrame | None = None  # of a file in metres, with its middle at longitude and latitude 0
-    _grid: Transformer | None = None
-
-    @property
-    def converts(self) -> bool:
-        return self.frame is not None or self._grid is not None
+    grid: Transformer | None = None
 
     def to_lonlat(self, points: FloatArray) -> FloatArray:
         if self.frame is not None:
             return self.frame.to_lonlat(points)
-        if self._grid is None or not len(points):
+        if self.grid is None or not len(points):
             return points
-        return np.column_stack(self._grid.transform(points[:, 0], points[:, 1]))
+        return np.column_stack(self.grid.transform(points[:, 0], points[:, 1]))
 
     @classmethod
     def of(cls, document: dict[str, Any]) -> Positions:
@@ -367,7 +362,7 @@ class Positions:
                 raise InputError(
                     f"crs is {grid[1]}, in which the positions lie nowhere on the globe; {_ADVICE}"
                 )
-            return cls(found=f"positions are in {grid[1]}, as the file's crs says", _grid=grid[0])
+            return cls(found=f"positions are in {grid[1]}, as the file's crs says", grid=grid[0])
         # The smaller side: a ring across the date line is 360° long.
         if rings and float(np.median([np.ptp(ring, axis=0).min() for ring in rings])) > LARGEST_DEGREES:
             raise InputError(f"outlines are wider than {LARGEST_DEGREES:g}, too wide for degrees; {_ADVICE}")

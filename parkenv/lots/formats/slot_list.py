@@ -1,7 +1,5 @@
 """Lists of slots: a CSV file of slot centres, and the lot inferred from it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -28,8 +26,6 @@ SAME_PLACE = 0.1  # distance, m, within which two slot centres are one slot list
 
 @dataclass(frozen=True, eq=False)
 class SlotList:
-    """Slots given by their centres."""
-
     ids: tuple[str, ...]  # n_slots names
     xy: FloatArray  # (n_slots, 2) m
     yaw: FloatArray | None  # (n_slots,) rad, heading of a car parked nose-in; None without the column

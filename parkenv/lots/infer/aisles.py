@@ -412,7 +412,12 @@ def _centre_line(xy: FloatArray, along: FloatArray, pitch: FloatArray) -> FloatA
 
 def _curve(xy: FloatArray, half: float) -> FloatArray:
     """Return a curve through scattered points: the longest path in their minimum spanning tree, smoothed."""
-    nodes = np.array([xy[group].mean(axis=0) for group in _groups(xy, 1.6)])
+    left, middles = np.ones(len(xy), dtype=bool), []
+    while left.any():
+        near = left & (np.hypot(*(xy - xy[left.argmax()]).T) <= 1.6)
+        middles.append(xy[near].mean(axis=0))
+        left &= ~near
+    nodes = np.array(middles)
     if len(nodes) < 3:
         far = np.unravel_index(
             np.argmax(np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))), (len(xy),) * 2
@@ -432,15 +437,6 @@ def _curve(xy: FloatArray, half: float) -> FloatArray:
         line = np.concatenate([line[:1], (line[:-2] + line[1:-1] + line[2:]) / 3, line[-1:]])
     line = shapely.get_coordinates(shapely.simplify(shapely.LineString(line), SMOOTH))
     return _lengthened(line, half)
-
-
-def _groups(xy: FloatArray, reach: float) -> list[NDArray[np.bool_]]:
-    left = np.ones(len(xy), dtype=bool)
-    groups = []
-    while left.any():
-        groups.append(left & (np.hypot(*(xy - xy[left.argmax()]).T) <= reach))
-        left &= ~groups[-1]
-    return groups
 
 
 def _lengthened(line: FloatArray, by: float) -> FloatArray:

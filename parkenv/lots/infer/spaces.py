@@ -9,10 +9,9 @@ A row is a chain of spaces side by side, or end to end along a kerb. From centre
 3. A space is as wide, along a kerb as long, as the row's spacing allows; its other side has the default size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import shapely
@@ -57,8 +56,8 @@ class Spaces:
         corners = corner_points(self.xy, yaw, self.length - shrink, self.width - shrink)
         return np.atleast_1d(np.asarray(shapely.polygons(corners)))
 
-    def subset(self, index: IntArray) -> Spaces:
-        return Spaces(
+    def subset(self, index: IntArray) -> Self:
+        return type(self)(
             tuple(self.ids[i] for i in index.tolist()),
             self.xy[index],
             self.axis[index],
@@ -167,7 +166,7 @@ class Row:
     def __len__(self) -> int:
         return len(self.members)
 
-    def part(self, index: IntArray) -> Row:
+    def part(self, index: IntArray) -> Self:
         columns = {name: getattr(self, name)[index] for name in ("members", "along", "out", "half", "pitch")}
         return replace(self, **columns)
 

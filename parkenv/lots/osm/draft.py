@@ -49,9 +49,7 @@ from parkenv.lots.osm.parking import (
     exterior_rings,
     fill_outline,
     find_goals,
-    is_blind_end,
     is_building,
-    is_crossing,
     is_parking_area,
     is_space,
     kerb_of,
@@ -87,6 +85,7 @@ from parkenv.world.lot import Lane
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
 """Values of `parking` for slots that are not in the open at ground level."""
 FARTHEST = 100_000.0  # largest distance of parking and roads from the centre of a map, m
+BLIND = {("noexit", "yes"), ("highway", "turning_circle"), ("highway", "turning_loop")}  # tags of dead ends
 STREETS_AROUND = 60.0  # distance beyond the slots, m, within which streets are lanes if no bounds are given
 NO_AISLE = f"slots that no aisle reaches within {SLOT_REACH:g} m"  # reason for leaving out
 MAPPED, FILLED, KERBSIDE = "amenity=parking_space", "amenity=parking, rows by rule", "kerbside parking"
@@ -142,8 +141,6 @@ class _Part(NamedTuple):
 
 
 class MapImport:
-    """The state of an import: the map, its frame and buildings, and what is left out, by reason."""
-
     def __init__(self, name: str, place: OsmMap, frame: LocalFrame) -> None:
         self.name, self.place, self.frame = name, place, frame
         self.left_out: dict[str, list[str]] = defaultdict(list)
@@ -156,6 +153,9 @@ class MapImport:
                 a.element.id for a in areas if not shapely.area(a.polygon)
             ]
         return [a for a in areas if shapely.area(a.polygon) > 0.0]
+
+    def crossings(self) -> FloatArray:
+        return self.points(lambda e: e.tags.get("highway") == "crossing")
 
     def points(self, wanted: Callable[[OsmElement], bool]) -> FloatArray:
         positions = (e.lines[0] for e in self.nodes if wanted(e))
@@ -275,7 +275,7 @@ class _LotImport(MapImport):
     def line_kerbs(self) -> None:
         if not any(road.has_kerb_parking for road in self.roads):
             return
-        junctions = Junctions(self.roads, self.points(is_crossing))
+        junctions = Junctions(self.roads, self.crossings())
         corridors = shapely.union_all(
             [
                 shapely.LineString(road.points).buffer(CORRIDOR * road.half_width, cap_style="flat")
@@ -323,7 +323,7 @@ class _LotImport(MapImport):
             entries = (
                 street_junctions(roads, streets)
                 if edge is None
-                else open_ends(roads, edge, self.points(is_blind_end))
+                else open_ends(roads, edge, self.points(lambda e: not BLIND.isdisjoint(e.tags.items())))
             )
         goals, goal_note = points_in_frame(self.frame, self.options.goals), None
         if not len(goals):
@@ -540,8 +540,6 @@ MOST_IN_TOWN = 300_000  # maximum number of spaces in one file
 
 @dataclass(frozen=True, eq=False)
 class CarPark:
-    """What became of one car park of a town."""
-
     name: str
     spaces: int  # number of outlines
     draft: LotDraft | None  # its lot

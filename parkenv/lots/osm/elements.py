@@ -13,15 +13,13 @@ ways; others are listed: over a way, at some hours only (`restriction:conditiona
 `restriction:hgv`), and those that lack a member or whose ways do not end where they should.
 """
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import shapely
@@ -48,8 +46,6 @@ BEYOND = (np.nan, np.nan)  # position of a node that is not in the file
 
 @dataclass(frozen=True, eq=False)
 class OsmElement:
-    """A node, way or multipolygon."""
-
     id: str  # such as `way/123`, as in OpenStreetMap URLs
     tags: Mapping[str, str]  # its keys and values
     # (k, 2) degrees, longitude first: the single position of a node, the line of a way, the outer rings of a
@@ -66,7 +62,7 @@ class OsmElement:
     def is_closed(self) -> bool:
         return all(map(_is_ring, self.lines))
 
-    def closed(self) -> OsmElement:
+    def closed(self) -> Self:
         """Return the element with its outline closed by a straight line, as where the edge of a map cuts it."""
         rings = tuple(_closed(self.lines))
         return self if self.is_closed or not rings else replace(self, lines=rings, cut=True)
@@ -93,7 +89,7 @@ class OsmMap:
         cut = [e.id for e in self.elements if e.cut]
         return tuple(map(str, LeftOut.by_reason({"cut at the edge of the map": cut})))
 
-    def within(self, bounds: tuple[tuple[float, float], tuple[float, float]]) -> OsmMap:
+    def within(self, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Self:
         """Cut roads at a box, two corners of latitude and longitude; others need half of their corners inside."""
         corners = np.array(bounds)[:, ::-1]
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -394,7 +390,7 @@ def _read_osm(path: Path) -> OsmMap:
 
 
 def _map_of_geojson(features: list[Any], positions: Positions) -> OsmMap:
-    to_lonlat = positions.to_lonlat if positions.converts else None
+    to_lonlat = positions.to_lonlat if positions.frame or positions.grid else None
     elements: dict[str, OsmElement] = {}
     for index, feature in enumerate(features):
         element = _feature_element(index, feature, to_lonlat)

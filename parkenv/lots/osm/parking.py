@@ -5,10 +5,9 @@ Both tagging schemes of kerbs are read: `parking:left|right|both` with `:orienta
 certain hours (`:conditional`) are ignored. A capacity of `both` applies to each side.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import shapely
@@ -149,8 +148,6 @@ STRAIGHT_ON = np.radians(30.0)
 
 @dataclass(frozen=True)
 class Kerb:
-    """Parking along one side of a street."""
-
     orientation: str  # a key of `ARRANGEMENTS`
     capacity: int | None  # number of slots; None if not tagged
     on_carriageway: bool  # whether parked cars are within `width`
@@ -398,7 +395,7 @@ class Area:
     polygon: shapely.Geometry
 
     @classmethod
-    def of(cls, element: OsmElement, frame: LocalFrame, *, simple: bool) -> Area:
+    def of(cls, element: OsmElement, frame: LocalFrame, *, simple: bool) -> Self:
         """Return the area of a closed element; outlines that cross themselves are refused if `simple`, else mended."""
         if not element.is_closed:
             raise InputError(f"{element.id}: its outline is open, want its first position again at the end")
@@ -432,15 +429,6 @@ def areas_of(
 
 def is_building(element: OsmElement) -> bool:
     return element.tags.get("building", "no") != "no"
-
-
-def is_crossing(element: OsmElement) -> bool:
-    return element.tags.get("highway") == "crossing"
-
-
-def is_blind_end(element: OsmElement) -> bool:
-    tags = element.tags
-    return tags.get("noexit") == "yes" or tags.get("highway") in ("turning_circle", "turning_loop")
 
 
 def within(areas: Sequence[Area], box: tuple[float, float, float, float] | None) -> list[Area]:

@@ -73,8 +73,6 @@ SIDES: tuple[Side, Side] = ("left", "right")
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A way open to cars."""
-
     id: str  # such as `way/123`
     tags: Mapping[str, str]  # tags of the way
     points: FloatArray  # (k, 2) m, in the direction of traffic if one-way

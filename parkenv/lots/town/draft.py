@@ -44,7 +44,6 @@ from parkenv.lots.osm.parking import (
     Area,
     exterior_rings,
     is_building,
-    is_crossing,
     is_parking_area,
     is_space,
     without_overlaps,
@@ -202,7 +201,13 @@ class _TownImport(MapImport):
         parts, by_rank = self.drawn_slots(spaces, lanes, self.roads)
         if not parts:
             return
-        owner = self._owners(np.array([part.polygon for part in parts], dtype=np.object_))
+        polygons = np.array([part.polygon for part in parts], dtype=np.object_)
+        near = shapely.STRtree(polygons).query(polygons, predicate="dwithin", distance=SAME_CAR_PARK)
+        owner = len(self.parking) + component_labels(near.T, len(polygons))
+        if self.parking:
+            tree = shapely.STRtree([a.polygon for a in self.parking])
+            space, park = tree.query(shapely.point_on_surface(polygons), predicate="intersects")
+            owner[space[::-1]] = park[::-1]
         groups: dict[int, tuple[list[Slots], list[Rules]]] = defaultdict(lambda: ([], []))
         for _, index, slots in by_rank:
             for k in np.unique(owner[index]).tolist():
@@ -226,15 +231,6 @@ class _TownImport(MapImport):
                 row.capacity_from = "tag"
             self.rows.append(row)
 
-    def _owners(self, polygons: Any) -> Any:
-        near = shapely.STRtree(polygons).query(polygons, predicate="dwithin", distance=SAME_CAR_PARK)
-        owner = len(self.parking) + component_labels(near.T, len(polygons))
-        if self.parking:
-            tree = shapely.STRtree([a.polygon for a in self.parking])
-            space, park = tree.query(shapely.point_on_surface(polygons), predicate="intersects")
-            owner[space[::-1]] = park[::-1]
-        return owner
-
     def read_kerbs(self, untagged: float) -> None:
         sides: list[FacilityRow] = []
         for k, area in enumerate(self.parking):
@@ -243,7 +239,7 @@ class _TownImport(MapImport):
                 if side is not None:
                     self.used.add(k)
                     sides.append(side)
-        sides += kerb_sides(self.roads, self.points(is_crossing), self.buildings, self.left_out, untagged)
+        sides += kerb_sides(self.roads, self.crossings(), self.buildings, self.left_out, untagged)
         half_widths = [CORRIDOR * road.half_width for road in self.roads]
         corridors = shapely.buffer(self.lines, half_widths, cap_style="flat")
         # Several runs of one way are one kerb.
