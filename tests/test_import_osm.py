@@ -263,7 +263,7 @@ def test_deleted_elements_are_not_there(tmp_path):
     assert "way/4" not in draft.slot_ids
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(
     turn=st.floats(-3.2, 3.2),
     aisle=st.floats(5.0, 9.0),

@@ -110,7 +110,7 @@ def test_bounds_keep_a_part(tmp_path):
         of_lot(tmp_path, lot, bounds=((1000.0, 0.0), (1010.0, 50.0)))
 
 
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(
     turn=st.floats(-3.2, 3.2),
     shift=st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)),
@@ -140,7 +140,7 @@ def test_a_moved_list_gives_the_same_lot_moved(tmp_path, turn, shift, rows, colu
     np.testing.assert_allclose(lanes[1], moved(lanes[0]), atol=0.3)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 10_000))
 def test_inexact_lists_give_lots_in_which_every_slot_opens_to_a_lane(tmp_path, seed):
     rng = np.random.default_rng(seed)

@@ -31,6 +31,8 @@ from parkenv.lots.town.supply import (
     kerb_rules,
     rules_of,
 )
+from parkenv.scenarios.spec import lot_scenario
+from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.drive_graph import build_drive_graph
 from parkenv.world.lot import Lane
 from parkenv.world.tariff import Hours
@@ -402,10 +404,8 @@ def test_a_part_is_cut_out_and_a_town_of_guessed_kerbs_says_so(tmp_path):
     assert part.n_slots / whole.draft.lot().n_slots == pytest.approx(0.5 * free / all_of_it, rel=0.1)
     caution = read_provenance(out).caution
     assert f"{part.n_slots} of {part.n_slots} spaces (100 %)" in caution
-    driven = parkenv(
-        "fleet", "--lot", out, *"--arrivals-per-hour 5 -n 1 --no-figures -j 1 --out".split(), tmp_path / "f"
-    )
-    assert caution in driven.stdout, driven.stderr
+    fleet = FleetStudy().changed(scenarios=(lot_scenario(out),))
+    assert list(fleet.cautions().values()) == [caution]
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, dijkstra
 from typer.testing import CliRunner
@@ -68,6 +68,7 @@ def with_exact(slot, **changes):
     slot["properties"].update({**shape, **changes})
 
 
+@settings(max_examples=15)
 @given(
     rows=st.integers(1, 5),
     columns=st.integers(1, 5),
