@@ -27,7 +27,7 @@ def one_line(error, *named):
 # ---- demand ----
 
 DEMAND = {
-    "negative arrivals": ({"arrivals_per_hour": -3}, "arrivals_per_hour is -3"),
+    "negative arrivals": ({"arrivals_per_hour": -3}, "arrivals_per_hour.0 is -3"),
     "no number": ({"arrivals_per_hour": [1.0] * 23 + [float("nan")]}, "arrivals_per_hour.23 is nan"),
     "a class that no zone names": ({"classes": {"vip": 0.5}}, "demand.x.classes has 'vip'"),
     "a class of everybody": ({"classes": {"public": 0.5}}, "demand.x.classes has 'public'"),
