@@ -24,8 +24,7 @@ from parkenv.studies.workers import worker_start
 from parkenv.world.lot import PARK, ParkingLot
 from planners.agent import make_agent
 from planners.thesis import label_setting
-from planners.thesis.label_repair import repair
-from planners.thesis.label_setting import Labels, StoppingGraph
+from planners.thesis.label_setting import Labels, StoppingGraph, repair
 from planners.thesis.mdp import ParkingMDP
 from planners.thesis.policy_iteration import policy_iteration
 

@@ -16,28 +16,14 @@ if TYPE_CHECKING:
     from planners.thesis.policy_iteration import Solution, policy_iteration
 
 _MODULES = {
-    "AGENT_NAMES": "names",
-    "Agent": "agent",
-    "CirclingWarning": "thesis.mdp",
-    "ParkingMDP": "thesis.mdp",
-    "SearchAgent": "agent",
-    "Solution": "thesis.policy_iteration",
-    "label_setting": "thesis.label_setting",
-    "make_agent": "agent",
-    "policy_iteration": "thesis.policy_iteration",
-}
-
+    "AGENT_NAMES": "names", "Agent": "agent", "CirclingWarning": "thesis.mdp", "ParkingMDP": "thesis.mdp",
+    "SearchAgent": "agent", "Solution": "thesis.policy_iteration", "label_setting": "thesis.label_setting",
+    "make_agent": "agent", "policy_iteration": "thesis.policy_iteration",
+}  # fmt: skip
 __all__ = [
-    "AGENT_NAMES",
-    "Agent",
-    "CirclingWarning",
-    "ParkingMDP",
-    "SearchAgent",
-    "Solution",
-    "label_setting",
-    "make_agent",
+    "AGENT_NAMES", "Agent", "CirclingWarning", "ParkingMDP", "SearchAgent", "Solution", "label_setting", "make_agent",
     "policy_iteration",
-]
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
@@ -31,7 +30,6 @@ class Agent(Protocol):
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
         """Return an action for an observation, and the state to pass to the next call."""
-        ...
 
 
 @runtime_checkable
@@ -40,18 +38,6 @@ class ClairvoyantAgent(Protocol):
 
     def prepare(self, world: World, time: float) -> None:
         """Receive the world of the next episode and its start time, s since Monday 00:00."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class PlanPreview:
-    """Where an agent intends to drive, for replays and pictures.
-
-    Attributes:
-        path: vertices ahead, in order, without the current one; empty if the agent has no plan.
-    """
-
-    path: tuple[int, ...] = ()
 
 
 class SearchAgent(ABC, Generic[Memory]):
@@ -95,7 +81,6 @@ class SearchAgent(ABC, Generic[Memory]):
         Returns:
             The action, () or (n_envs,) int64, and the state to pass to the next call.
         """
-        del deterministic
         if "vertex" not in observation:
             raise InputError(
                 f'observation holds {", ".join(observation)}, want one of parkenv/Search-v2 with observation="full"'
@@ -115,16 +100,15 @@ class SearchAgent(ABC, Generic[Memory]):
         missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
         return int(missing[0]) if len(missing) else int(self.problem.move_cost_s[vertex].argmin())
 
-    def plan_preview(self, observation: Observation, action: int, memory: Memory) -> PlanPreview:
-        """Return where the agent intends to drive, right after `predict` chose `action`, without side effects.
+    def plan_preview(self, observation: Observation, action: int, memory: Memory) -> tuple[int, ...]:
+        """Return the vertices ahead, in order, right after `predict` chose `action`; none if there is no plan.
 
         Args:
             observation: the last argument of `predict`.
             action: the action that it chose.
             memory: the state that `predict` returned.
         """
-        del observation, action, memory
-        return PlanPreview()
+        return ()
 
 
 def predict_each(
@@ -163,9 +147,7 @@ def belief_for_decision(observation: Observation) -> SlotBelief:
 def require_observations(name: str, problem: SearchProblem) -> None:
     """Raise an `InputError` for the agent `name` if the problem's sensor can never observe a slot from the lane."""
     if not problem.sensor_rates.seen.any():
-        raise InputError(
-            f"{name} plans on observations from the lane, and this sensor model has none; take mdp"
-        )
+        raise InputError(f"{name} plans on observations, and this sensor model has none; take mdp")
 
 
 def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
@@ -189,10 +171,8 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
         if options:
             raise InputError(f"agent {name!r} has no options; got {', '.join(options)}")
         if before == HUMAN:
-            recorded: Agent = import_module("planners.human").HumanAgent(scenario, after)
-            return recorded
-        learned: Agent = import_module("planners.model_file").LearnedAgent(scenario, before, after)
-        return learned
+            return _loaded("planners.human", "HumanAgent")(scenario, after)
+        return _loaded("planners.model_file", "LearnedAgent")(scenario, before, after)
     if colon and before == NETWORK:
         options, name, colon = {"weights": after, **options}, NETWORK, ""
     agent, known = _class_of(name), agent_options(name)
@@ -216,9 +196,6 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
 def agent_options(name: str) -> tuple[str, ...]:
     """Return the names of the options that an agent has; none if it comes from a file.
 
-    Args:
-        name: a name that `make_agent` accepts.
-
     Examples:
         >>> agent_options("exact")
         ('most_states',)
@@ -230,31 +207,26 @@ def agent_options(name: str) -> tuple[str, ...]:
 
 
 def _class_of(name: str) -> Callable[..., Agent]:
-    """Return the class of an agent, one of `AGENTS` or `MODULE:CLASS`."""
     if ":" in name:
-        own: Callable[..., Agent] = load_class(
-            name,
-            "agent",
-            "predict(observation, state, episode_start, deterministic)",
-            alternatives=f"; nor is it an algorithm ({', '.join(FILE_AGENTS)})",
-        )
+        wanted = "predict(observation, state, episode_start, deterministic)"
+        known = f"; nor is it an algorithm ({', '.join(FILE_AGENTS)})"
+        own: Callable[..., Agent] = load_class(name, "agent", wanted, alternatives=known)
         return own
     if name not in AGENTS:
         raise InputError(
             f"unknown agent {name!r}; {nearest(name, AGENTS)}, ALGORITHM:FILE for a trained model, MODULE:CLASS for "
             "your own"
         )
-    module, class_name = AGENTS[name]
-    found: Callable[..., Agent] = getattr(import_module(module), class_name)
-    return found
+    return _loaded(*AGENTS[name])
+
+
+def _loaded(module: str, class_name: str) -> Callable[..., Agent]:
+    kind: Callable[..., Agent] = getattr(import_module(module), class_name)
+    return kind
 
 
 def shown_name(name: str) -> str:
-    """Return the name of an agent for tables: the attribute `name` of a user's class, if it has one.
-
-    Args:
-        name: a name that `make_agent` accepts.
-    """
+    """Return the name of an agent for tables: the attribute `name` of a user's class, if it has one."""
     before, colon, _ = name.partition(":")
     if not colon or before in FILE_AGENTS:
         return name
@@ -263,14 +235,7 @@ def shown_name(name: str) -> str:
 
 
 def agent_file(name: str) -> Path | None:
-    """Return the file that defines an agent: a trained model, or the module of a user's agent.
-
-    Args:
-        name: the name, already passed to `make_agent` once.
-
-    Returns:
-        None for the agents that come with the package.
-    """
+    """Return the file that defines an agent that `make_agent` has made: a trained model, or a user's module."""
     before, colon, after = name.partition(":")
     if not colon:
         return None

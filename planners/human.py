@@ -59,7 +59,6 @@ class HumanAgent(SearchAgent[Iterator[int]]):
             raise InputError(f"{path}: worlds has a world twice, want each once")
 
     def begin(self, observation: Observation, belief: SlotBelief) -> Iterator[int]:
-        del belief
         start = (np.float32(observation["time"][0]), int(observation["vertex"]))
         if start not in self._actions:
             raise InputError(
@@ -68,7 +67,6 @@ class HumanAgent(SearchAgent[Iterator[int]]):
         return map(int, self._actions[start])
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: Iterator[int]) -> int:
-        del observation, belief
         if (action := next(memory, None)) is None:
             raise InputError(f"{self.name}: actions end before the search does")
         return action

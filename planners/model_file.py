@@ -2,8 +2,7 @@
 
 The file begins with the length of the header, 8 bytes, little-endian, and the header, JSON; the tensors follow. The
 card is JSON in the header's metadata. It holds what is needed to build the policy again, and what the model was trained
-on. Archives that stable-baselines3 writes itself hold pickled Python objects, which run code; see
-`convert_archive`.
+on. Archives that stable-baselines3 writes itself hold pickled Python objects, which run code.
 """
 
 from __future__ import annotations
@@ -13,14 +12,15 @@ import warnings
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from pydantic import Field, JsonValue, model_validator
+from pydantic import ConfigDict, Field, JsonValue, model_validator
 from pydantic_core import to_jsonable_python
 
+from parkenv.engine.local_observation import FIRST_NEAR, PER_NEAR, local_space
 from parkenv.errors import InputError, with_extra
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import parse_json, read_bytes
@@ -31,13 +31,10 @@ from parkenv.world.scenario import SearchProblem
 from planners.names import ALGORITHMS
 
 SUFFIX = ".safetensors"
-CARD_KEY = "parkenv"
-"""Key of the card in the metadata."""
+CARD_KEY = "parkenv"  # key of the card in the metadata
 _MAX_HEADER = 1_000_000
 OBSERVATION = "local-1"
 """Version of the layout of `parkenv.engine.local_observation`, which search models observe."""
-FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
-"""Size of that observation: for k slots, 46 + 8k numbers."""
 _MAX_BYTES = 500_000_000
 _MAX_WEIGHT = 1e6  # products of larger ones over several layers could overflow
 _ZIP = b"PK"
@@ -47,16 +44,10 @@ Width = Annotated[int, Field(ge=1, le=1024)]
 Layers = Annotated[Several[Width], Field(max_length=8)]
 
 
-class ModelHeader(NamedTuple):
-    """Header of a model file."""
-
-    card: dict[str, Any]  # content of the card, not yet validated
-    tensors: dict[str, Any]  # entries with dtype, shape and data_offsets by name, not yet validated
-    body: memoryview  # the tensors
-
-
-def read_header(data: bytes, path: str | os.PathLike[str]) -> ModelHeader:
-    """Read the header of the content of a model file."""
+def read_header(
+    data: bytes, path: str | os.PathLike[str]
+) -> tuple[dict[str, Any], dict[str, Any], memoryview]:
+    """Return the card and the entries of the tensors, neither validated, and the bytes behind."""
     size = int.from_bytes(data[:8], "little")
     if data[8:9] != b"{" or size > min(_MAX_HEADER, len(data) - 8):
         raise InputError(f"{path}: no model file, or a damaged one")
@@ -68,31 +59,7 @@ def read_header(data: bytes, path: str | os.PathLike[str]) -> ModelHeader:
     card = parse_json(text, f"{path}: card")
     if not isinstance(card, dict):
         raise InputError(f"{path}: card is a {type(card).__name__}, want a JSON object")
-    return ModelHeader(card, header, memoryview(data)[8 + size :])
-
-
-class BoxSpace(Spec):
-    """A `gymnasium.spaces.Box` with equal bounds; None for unbounded."""
-
-    shape: Annotated[Several[Annotated[int, Field(ge=1, le=16_384)]], Field(max_length=1)]
-    dtype: Literal["float32", "int8"]
-    low: float | None = None
-    high: float | None = None
-
-    @classmethod
-    def of(cls, space: spaces.Space[Any]) -> Self:
-        if not isinstance(space, spaces.Box):
-            raise InputError(f"the model has a space {space}, want boxes of numbers")
-        low, high = (
-            float(v) if np.isfinite(v := bound.flat[0]) else None for bound in (space.low, space.high)
-        )
-        content = {"shape": space.shape, "dtype": str(space.dtype), "low": low, "high": high}
-        return cls.parse(content, "space of the model")
-
-    def box(self) -> spaces.Box:
-        low = -np.inf if self.low is None else self.low
-        high = np.inf if self.high is None else self.high
-        return spaces.Box(low, high, self.shape, np.dtype(self.dtype).type)
+    return card, header, memoryview(data)[8 + size :]
 
 
 class _WithNulls(Spec):
@@ -132,6 +99,8 @@ class PolicyOptions(_WithNulls):
 class ModelCard(_WithNulls):
     """Metadata of a model file."""
 
+    model_config = ConfigDict(extra="ignore")  # earlier cards held the spaces, which follow from k
+
     format: Literal["parkenv-model-2"] = "parkenv-model-2"
     algorithm: Literal["dqn", "ppo", "maskable-ppo", "recurrent-ppo"]
     task: Literal["search"] = "search"
@@ -139,8 +108,6 @@ class ModelCard(_WithNulls):
     k: int = Field(ge=1, le=1_000, description="Slots in the observation.")
     policy: Literal["MultiInputPolicy", "MultiInputLstmPolicy"]
     policy_options: PolicyOptions
-    observation_space: Annotated[dict[str, BoxSpace], Field(max_length=16)]
-    action_space: Annotated[int, Field(ge=1, le=1_000)]
     scenarios: Several[str] = Field((), description="Trained on.")
     held_out: Several[str] = Field((), description="Places never trained on, which it was evaluated in.")
     seed: int | None = Field(None, description="Of the training.")
@@ -164,17 +131,15 @@ class ModelCard(_WithNulls):
         if data.startswith(_ZIP):
             raise InputError(
                 f"{path}: is an archive of pickled objects, which run code when they are loaded; if you trust its "
-                f"author, convert it to a {SUFFIX} file: name it once with --trust-model (compare, benchmark run)"
+                f"author, load it with stable-baselines3 and write it by planners.model_file.save_model"
             )
-        return cls.parse(read_header(data, path).card, f"{path}: card")
+        return cls.parse(read_header(data, path)[0], f"{path}: card")
 
     def build(self) -> Any:
         """Build the policy, with random weights."""
-        observed = spaces.Dict({name: space.box() for name, space in self.observation_space.items()})
         kind = algorithm_class(self.algorithm).policy_aliases[self.policy]
-        return kind(
-            observed, spaces.Discrete(self.action_space), lambda _: 0.0, **self.policy_options.arguments()
-        )
+        actions = spaces.Discrete(len(ACTIONS))
+        return kind(local_space(self.k), actions, lambda _: 0.0, **self.policy_options.arguments())
 
 
 def algorithm_class(name: str) -> Any:
@@ -216,7 +181,6 @@ def save_model(
     algorithm = next((key for key, (_, class_name) in ALGORITHMS.items() if class_name == name), None)
     if algorithm is None:
         raise InputError(f"the model is a {name}, want one of {', '.join(ALGORITHMS)}")
-    k = slots_observed(model.observation_space)
     aliases = {kind: alias for alias, kind in type(model).policy_aliases.items()}
     options = {
         key: value.__name__ if isinstance(value, type) else value
@@ -226,10 +190,8 @@ def save_model(
     numbers = {key: None if value != value else float(value) for key, value in (results or {}).items()}
     card = ModelCard.parse(
         {
-            "algorithm": algorithm, "observation": OBSERVATION, "k": k,
+            "algorithm": algorithm, "observation": OBSERVATION, "k": slots_observed(model.observation_space),
             "policy": aliases.get(model.policy_class, model.policy_class.__name__), "policy_options": options,
-            "observation_space": {key: BoxSpace.of(space) for key, space in model.observation_space.items()},
-            "action_space": int(model.action_space.n),
             "scenarios": tuple(scenarios), "held_out": tuple(held_out), "seed": model.seed,
             "steps": model.num_timesteps, "settings": to_jsonable_python(dict(settings or {})),
             "results": numbers, "command": tuple(command),
@@ -245,9 +207,10 @@ def save_model(
 def slots_observed(space: spaces.Space[Any]) -> int:
     """Return k of a model's observation space."""
     shape = space["local"].shape if isinstance(space, spaces.Dict) and "local" in space.spaces else None
-    if not shape:
+    k = (shape[0] - FIRST_NEAR) // PER_NEAR if shape else 0
+    if k < 1 or space != local_space(k):
         raise InputError("the model does not observe `local`")
-    return (shape[0] - FIXED_NUMBERS) // NUMBERS_PER_SLOT
+    return k
 
 
 def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard, Any]:
@@ -258,10 +221,8 @@ def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard,
         raise InputError(f"{path}: is a model of {card.algorithm}, not of {algorithm}")
     if card.observation != OBSERVATION:
         raise InputError(
-            f"{path}: observes {card.observation!r}, this version of parkenv gives {OBSERVATION!r}; "
-            f"it was trained with parkenv {card.parkenv}"
+            f"{path}: observes {card.observation!r}, parkenv {card.parkenv}'s; want {OBSERVATION!r}"
         )
-    _require_spaces(card, path)
     try:
         policy = card.build()
         weights = import_module("safetensors.torch").load(data)
@@ -274,40 +235,6 @@ def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard,
         raise InputError(f"{path}: its network cannot be read ({type(error).__name__}: {error})") from error
     policy.set_training_mode(False)
     return card, policy
-
-
-def _require_spaces(card: ModelCard, path: str | os.PathLike[str]) -> None:
-    """Refuse a card whose observation or action differs from that of a search, which would fail in one."""
-    observed = {name: space.shape for name, space in card.observation_space.items()}
-    wanted = {"local": (FIXED_NUMBERS + NUMBERS_PER_SLOT * card.k,), "action_mask": (len(ACTIONS),)}
-    if observed != wanted or card.action_space != len(ACTIONS):
-        raise InputError(
-            f"{path}: card: observes {observed} and acts {card.action_space}, want {wanted} and {len(ACTIONS)}"
-        )
-
-
-def _no_rate(progress: float) -> float:
-    return 0.0 * progress
-
-
-def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:
-    """Convert an archive, `NAME.zip`, of stable-baselines3's `model.save` to a model file beside it; return that.
-
-    This unpickles the archive, which runs whatever code its author put there.
-    """
-    converted = Path(path).with_suffix(SUFFIX)
-    if converted.exists():
-        raise InputError(f"{converted}: exists; name it instead of {path}, or remove it")
-    # A model that is not trained further needs no replay buffer, and no schedules, which may be another package's.
-    unneeded: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
-    unneeded |= {"learning_rate": 0.0} | dict.fromkeys(("lr_schedule", "clip_range"), _no_rate)
-    kind = algorithm_class(algorithm)
-    try:
-        model = kind.load(Path(path), device="cpu", custom_objects=unneeded)
-    except Exception as error:  # unpickling raises anything
-        raise InputError(f"{path}: no archive of {algorithm} ({type(error).__name__}: {error})") from error
-    save_model(model, converted)
-    return converted
 
 
 class LearnedAgent:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-EXPECTS_RIVALS = "belief-rivals"
-"""The agent with the option `arrivals_per_hour`: rivals an hour."""
+EXPECTS_RIVALS = "belief-rivals"  # the agent with the option `arrivals_per_hour`: rivals an hour
 AGENTS: dict[str, tuple[str, str]] = {
     "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
     "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
@@ -30,17 +29,11 @@ ALGORITHMS = {
     "recurrent-ppo": ("sb3_contrib", "RecurrentPPO"),
 }
 """Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
-NETWORK = "network"
-"""The agent whose weights can be another file: `network:FILE`."""
-HUMAN = "human"
-"""The agent that repeats what a person did in a game of `parkenv play`: `human:FILE`."""
-FILE_AGENTS = (*ALGORITHMS, NETWORK, HUMAN)
-"""Names before the colon of `NAME:FILE`."""
+NETWORK = "network"  # the agent whose weights can be another file: `network:FILE`
+HUMAN = "human"  # the agent that repeats what a person did in a game of `parkenv play`: `human:FILE`
+FILE_AGENTS = (*ALGORITHMS, NETWORK, HUMAN)  # names before the colon of `NAME:FILE`
 WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "greedy-total", "first-free", "random", "oracle")
 """Agents that make no use of an occupancy forecast."""
-SMALL_LOTS_ONLY = ("exact",)
-"""Agents for small lots and sensors without errors only."""
-BOUND = "bound"
-"""What no agent can beat in the mean; it drives no car."""
-AGENT_NAMES = tuple(name for name in AGENTS if name not in (*SMALL_LOTS_ONLY, BOUND))
-"""Agents for all lots."""
+SMALL_LOTS_ONLY = ("exact",)  # agents for small lots and sensors without errors only
+BOUND = "bound"  # what no agent can beat in the mean; it drives no car
+AGENT_NAMES = tuple(name for name in AGENTS if name not in (*SMALL_LOTS_ONLY, BOUND))  # agents for all lots

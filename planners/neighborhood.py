@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import require_whole
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.sensor_model import SensorRates
 from planners.belief.planning_graph import VIEW, PlanningGraph
@@ -43,7 +43,6 @@ class Neighborhood:
 
     @classmethod
     def of(cls, problem: SearchProblem, vertices: IntArray, entry: int) -> Neighborhood:
-        """Make the subgraph of some vertices, (k,) ascending."""
         lot = problem.lot
         whole, n_slots = len(vertices) == lot.n_vertices, int(np.searchsorted(vertices, lot.n_slots))
         neighbors, (starts, slots), rates = lot.neighbors, problem.slots_in_view, problem.sensor_rates
@@ -103,10 +102,7 @@ class Neighborhoods:
     """
 
     def __init__(self, problem: SearchProblem, most_vertices: int = MOST_VERTICES) -> None:
-        if not _LEAST_VERTICES <= most_vertices <= np.iinfo(np.int16).max:
-            raise InputError(
-                f"most_vertices is {most_vertices}, want {_LEAST_VERTICES} to {np.iinfo(np.int16).max}"
-            )
+        require_whole("most_vertices", most_vertices, least=_LEAST_VERTICES, most=np.iinfo(np.int16).max)
         self._problem, self._most = problem, most_vertices
         self._kept: OrderedDict[int, Neighborhood] = OrderedDict()
         self._whole: Neighborhood | None = None
@@ -124,18 +120,14 @@ class Neighborhoods:
         if self._whole is not None:
             return self._whole
         if vertex not in self._kept:
-            self._kept[vertex] = self._expand(
-                self._descend(vertex, self._least_s, self._far_s), self._least_s
-            )
+            entry = self._descend(vertex, self._least_s, self._far_s)
+            self._kept[vertex] = self._expand(entry, self._least_s)
             if len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return self._kept[vertex]
 
     def around(self, vertex: int, taken: IntArray) -> Neighborhood:
-        """Return the subgraph for continuing a search at a vertex after some slots, (k,), were observed taken.
-
-        It is expanded from the vertex, or, if that reaches no other slot, from the best other slot.
-        """
+        """Return the subgraph for going on from a vertex, or the best slot, that has others than `taken`, (k,)."""
         if self._whole is not None:
             return self._whole
         least_s = self._least(taken)
@@ -162,8 +154,8 @@ class Neighborhoods:
 
     def _expand(self, entry: int, least_s: FloatArray) -> Neighborhood:
         lot = self._problem.lot
-        found = _first_by_bound(entry, least_s, lot.neighbors, self._problem.move_cost_s, self._most)
-        return Neighborhood.of(self._problem, np.sort(found).astype(np.int64), entry)
+        vertices = _first_by_bound(entry, least_s, lot.neighbors, self._problem.move_cost_s, self._most)
+        return Neighborhood.of(self._problem, np.sort(vertices).astype(np.int64), entry)
 
 
 def _renumber(vertices: IntArray, numbers: NDArray[np.integer]) -> IntArray:
@@ -181,20 +173,20 @@ def _first_by_bound(
     settled = np.zeros(len(neighbors), np.bool_)
     room = neighbors.shape[1] * most + 1
     keys, vertices = np.empty(room), np.empty(room, np.int32)
-    found, n_found = np.empty(most, np.int32), 0
+    nearest, n_nearest = np.empty(most, np.int32), 0
     seconds[start] = 0.0
     size = push(keys, vertices, 0, 0.0, start)
-    while size > 0 and n_found < most:
+    while size > 0 and n_nearest < most:
         v = vertices[0]
         size = pop(keys, vertices, size)
         if settled[v]:
             continue
         settled[v] = True
-        found[n_found] = v
-        n_found += 1
+        nearest[n_nearest] = v
+        n_nearest += 1
         for m in range(neighbors.shape[1]):
             u = neighbors[v, m]
             if u >= 0 and seconds[v] + move_s[v, m] < seconds[u]:
                 seconds[u] = seconds[v] + move_s[v, m]
                 size = push(keys, vertices, size, seconds[u] + least_s[u], u)
-    return found[:n_found]
+    return nearest[:n_nearest]

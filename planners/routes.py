@@ -22,6 +22,7 @@ from planners.thesis.label_setting import edges_in
 _KEPT_TARGETS = 64
 _CHEAPER = 6  # about how many rows of next vertices take as long as one of drive times
 _NONE = -1
+NOWHERE = np.zeros(0, dtype=np.bool_)
 
 
 class DriveRoutes:
@@ -30,23 +31,28 @@ class DriveRoutes:
     def __init__(self, problem: SearchProblem) -> None:
         # Copies: numba would compile every function again for read-only arrays.
         self._neighbors, self._move_s = problem.lot.neighbors.copy(), problem.move_cost_s.copy()
-        n_moves = len(MOVES)
-        self._out_start = np.arange(0, n_moves * len(self._neighbors) + 1, n_moves, dtype=np.int32)
-        self._out_target, self._out_s = self._neighbors.ravel(), self._move_s.ravel()
-        self._in_start, self._in_source, _, self._in_s = edges_in(self._neighbors, self._move_s)
+        # Edges as `search` takes them, outward and inward.
+        self.edges = edges_out(self._neighbors, self._move_s)
+        start, source, _, seconds = edges_in(self._neighbors, self._move_s)
+        self._edges_in = start, source, seconds
         self._moves: OrderedDict[int, dict[int, int]] = OrderedDict()
 
-    def seconds_from(self, vertex: int) -> FloatArray:
-        """Return the drive time, (n_vertices,) s, from a vertex to every other; inf where unreachable."""
-        nowhere = np.zeros(0, dtype=np.bool_)
-        return self._outward(vertex, nowhere)[0]
+    def seconds_from(self, vertex: int, walls: NDArray[np.bool_] = NOWHERE) -> FloatArray:
+        """Return the drive time, (n_vertices,) s, from a vertex to every other; inf where unreachable.
+
+        No drive leads through `walls`, (n_vertices,) bool, or none.
+        """
+        seconds = np.full(len(self._neighbors), np.inf)
+        search(*self.edges, vertex, NOWHERE, walls, seconds)
+        return seconds
 
     def nearest(self, vertex: int, slots: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float]:
         """Return the nearest of `slots`, (n_slots,) bool, from a vertex, and their drive time, s.
 
         They are (k,) int64, ascending; none and inf if none is reachable.
         """
-        seconds, reached = self._outward(vertex, slots)
+        seconds = np.full(len(self._neighbors), np.inf)
+        reached = search(*self.edges, vertex, slots, NOWHERE, seconds)
         if reached == _NONE:
             return np.empty(0, dtype=np.int64), np.inf
         least = float(seconds[reached])
@@ -77,19 +83,13 @@ class DriveRoutes:
             vertex = int(self._neighbors[vertex, move])
             yield move, vertex
 
-    def _outward(self, vertex: int, ends: NDArray[np.bool_]) -> tuple[FloatArray, int]:
-        """Return drive times, exact up to the nearest of `ends` and upper bounds beyond, and that nearest vertex."""
-        seconds = np.full(len(self._neighbors), np.inf)
-        reached = _search(self._out_start, self._out_target, self._out_s, vertex, ends, seconds)
-        return seconds, int(reached)
-
     def _moves_along(self, vertex: int, target: int) -> dict[int, int]:
         """Return the moves of a shortest route, keyed by the vertex at which each is made; empty without a route."""
         seconds = np.full(len(self._neighbors), np.inf)
         end = np.zeros(vertex + 1, dtype=np.bool_)
         end[vertex] = True
         moves: dict[int, int] = {}
-        if _search(self._in_start, self._in_source, self._in_s, target, end, seconds) == _NONE:
+        if search(*self._edges_in, target, end, NOWHERE, seconds) == _NONE:
             return moves
         while vertex != target:
             following = self._neighbors[vertex]
@@ -99,20 +99,29 @@ class DriveRoutes:
         return moves
 
 
+def edges_out(
+    neighbors: NDArray[np.int32], move_s: FloatArray
+) -> tuple[NDArray[np.int32], NDArray[np.int32], FloatArray]:
+    """Return the edges as `search` takes them: copies, since numba compiles again for read-only arrays."""
+    start = np.arange(0, neighbors.size + 1, len(MOVES), dtype=np.int32)
+    return start, neighbors.flatten(), move_s.flatten()
+
+
 @compiled(error_model="numpy")
-def _search(
+def search(
     start: NDArray[np.int32],
     leads_to: NDArray[np.int32],
     edge_s: FloatArray,
     origin: int,
     ends: NDArray[np.bool_],
+    walls: NDArray[np.bool_],
     seconds: FloatArray,
 ) -> int:
     """Run Dijkstra's algorithm until the first of `ends`, (k,) bool of the first k vertices, is settled.
 
     The edges of v are rows `start[v]` to `start[v + 1]` of `leads_to`, the vertex at the other end or -1, and `edge_s`.
-    `seconds`, (n,), all inf at first, become drive times, exact up to the vertex where the search stopped, upper bounds
-    beyond. Return one of the nearest of `ends`, or -1.
+    Those of `walls`, (n,) bool, or none, lead nowhere. `seconds`, (n,), all inf at first, become drive times, exact up
+    to the vertex where the search stopped, upper bounds beyond. Return one of the nearest of `ends`, or -1.
     """
     keys, vertices = np.empty(len(leads_to) + 1), np.empty(len(leads_to) + 1, dtype=np.int32)
     seconds[origin] = 0.0
@@ -124,6 +133,8 @@ def _search(
             continue
         if v < len(ends) and ends[v]:
             return int(v)
+        if v < len(walls) and walls[v]:
+            continue
         for e in range(start[v], start[v + 1]):
             u = np.int64(leads_to[e])
             if u >= 0 and far + edge_s[e] < seconds[u]:
@@ -179,7 +190,6 @@ class RoadTable:
             self._ready = n, end
 
     def move(self, vertex: int, target: int) -> int:
-        """Return the first move of a shortest route."""
         following = int(self.following[vertex, target])
         if following < 0:
             raise InputError(f"no route leads from vertex {vertex} to vertex {target}")

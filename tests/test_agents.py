@@ -12,7 +12,6 @@ from parkenv.lots import grid_lot
 from parkenv.studies.compare.cases import Case, settings_of
 from parkenv.studies.episodes import EpisodeRunner
 from planners import AGENT_NAMES, make_agent
-from planners.routes import DriveRoutes
 
 SEEDS = range(12)
 
@@ -133,16 +132,6 @@ def test_a_batch_of_observations_gives_the_actions_of_the_single_ones(name):
             observations[i] = env.step(action)[0] if not env.unwrapped.state.over else observations[i]
 
 
-def test_stable_baselines_evaluates_a_planner():
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.evaluation import evaluate_policy
-
-    scenario = make_scenario("mini")
-    venv = make_vec_env(lambda: gym.make("parkenv/Search-v2", scenario=scenario), n_envs=2, seed=0)
-    reward, _ = evaluate_policy(make_agent("mdp", scenario), venv, n_eval_episodes=6)
-    assert -120.0 < reward < 0.0
-
-
 def test_random_agent_repeats_itself_under_a_seed():
     scenario = make_scenario("mini")
     one, again, other = (
@@ -152,39 +141,6 @@ def test_random_agent_repeats_itself_under_a_seed():
         )
     )
     assert one == again != other
-
-
-# --- strategies ------------------------------------------------------------------------------------
-
-
-def parked_slot(scenario, agent, **options):
-    runner = EpisodeRunner(scenario, agent, make_agent(agent, scenario, **options))
-    return scenario.lot.slot_ids.index(runner.run(0).row["slot"])
-
-
-def test_strategies_park_where_their_names_say():
-    lot = grid_lot(2, 30)
-    walk, rng = lot.walk_m(), np.random.default_rng(5)
-    taken = rng.random(lot.n_slots) < 0.6
-    scenario = frozen_world(lot, taken)
-    free = np.flatnonzero(~taken)
-    assert parked_slot(scenario, "greedy-goal") == free[walk[free].argmin()]
-    seconds = DriveRoutes(scenario).seconds_from(int(lot.entry_vertices[0]))[: lot.n_slots]
-    assert parked_slot(scenario, "greedy-drive") == free[seconds[free].argmin()]
-    near_and_free = free[walk[free] <= 40.0]
-    first = parked_slot(scenario, "first-free", within_m=40.0)
-    assert first in near_and_free
-    assert seconds[first] <= seconds[near_and_free].min() + 10.0
-    assert parked_slot(scenario, "first-free", within_m=1e3) == parked_slot(scenario, "greedy-drive")
-
-
-def test_strategies_find_the_only_free_slot():
-    lot = grid_lot(4, 12)
-    taken = np.ones(lot.n_slots, dtype=bool)
-    taken[29] = False
-    scenario = frozen_world(lot, taken)
-    for agent in ("greedy-goal", "greedy-drive", "first-free", "mdp", "oracle"):
-        assert parked_slot(scenario, agent) == 29, agent
 
 
 @pytest.mark.parametrize("agent", ["mdp", "greedy-goal", "greedy-drive", "first-free", "random"])
@@ -206,34 +162,11 @@ def test_a_search_cut_off_is_charged_like_one_that_gave_up():
     assert row["truncated"]
     assert row["total_s"] == pytest.approx(row["drive_s"] + row["failed_s"] + 500.0)
     assert row["steps"] == 2000
+    assert row["failed_parks"] > 100, "it keeps trying"
+    assert row["replans"] == 0
 
 
 # --- the planner -----------------------------------------------------------------------------------
-
-
-def test_the_planner_plans_again_only_when_a_probability_changes():
-    """If observations agree with the forecast, the only change is that slots become certain."""
-    lot = grid_lot(2, 20)
-    scenario = frozen_world(lot, np.arange(lot.n_slots) % 2 == 0, sensor_model=SensorModel(view_range=0.0))
-    agent = make_agent("mdp", scenario)
-    env = gym.make("parkenv/Search-v2", scenario=scenario)
-    observation, _ = env.reset(seed=0)
-    _, memory = agent.predict(observation)
-    assert memory.replans == 0
-    agent.predict(observation, memory)
-    assert memory.replans == 0
-    for p_occupied in (1.0, 0.997):  # a sighting that has aged a little is not news
-        observation["p_occupied"][3] = p_occupied
-        agent.predict(observation, memory)
-        assert memory.replans == 1
-
-
-def test_the_static_planner_keeps_trying_its_taken_slot():
-    lot = grid_lot(2, 8)
-    scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), sensor_model=SensorModel(view_range=0.0))
-    row = EpisodeRunner(scenario, "mdp-static", make_agent("mdp-static", scenario)).run(0).row
-    assert row["failed_parks"] > 100
-    assert row["replans"] == 0
 
 
 def test_the_planner_never_tries_a_slot_that_it_sees_taken():
@@ -323,13 +256,3 @@ def test_on_jam_a_low_failure_cost_is_over_confident_and_a_high_one_is_not():
     assert mean(careful, "replans") < 0.6 * mean(bold, "replans")
     assert mean(careful, "walked_m") > mean(bold, "walked_m") + 5.0
     assert mean(bold, "replans") > 20.0
-
-
-@pytest.mark.parametrize("name", ["campus", "jam"])
-def test_who_walks_as_fast_as_they_drive_parks_by_the_entry(name):
-    """Fig. 4.11b."""
-    scenario = setting(name, 10.0, 10.0, 10.0)
-    planner, nearest = (episodes(scenario, a, range(40)) for a in ("mdp", "greedy-drive"))
-    assert mean(planner, "driven_m") <= 1.1 * mean(nearest, "driven_m")
-    slow_walk = episodes(setting(name, 10.0, 4.0, 10.0), "mdp", range(40))
-    assert mean(planner, "walked_m") > mean(slow_walk, "walked_m") + 10.0

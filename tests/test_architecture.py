@@ -20,8 +20,8 @@ LAYERS = (
     "scenarios", "driving", "engine", "show", "envs", "studies", "cli",
 )  # fmt: skip
 PLANNERS_MAY_SEE = (
-    "parkenv.compiled", "parkenv.world", "parkenv.belief", "parkenv.driving", "parkenv.engine.model",
-    "parkenv.engine.policy", "parkenv.errors", "parkenv.files", "parkenv.version",
+    "parkenv.compiled", "parkenv.world", "parkenv.belief", "parkenv.driving", "parkenv.engine.local_observation",
+    "parkenv.engine.model", "parkenv.engine.policy", "parkenv.errors", "parkenv.files", "parkenv.version",
 )  # fmt: skip
 
 

@@ -13,8 +13,6 @@ from parkenv.studies.fleet.setting import Setting
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.lot import PARK
 from planners import make_agent
-from planners.belief.agent import Crowd
-from planners.belief.rivals import PASSED, _take_rates
 
 
 def actions(agent, scenario, seed):
@@ -82,25 +80,6 @@ def test_where_slots_vanish_it_prefers_the_free_slot_at_hand_to_a_better_one_fur
         assert (learned == PARK) == (in_view > 0), "whoever meets many cars reckons with many"
 
 
-def test_a_car_is_met_when_it_comes_into_view_and_not_while_it_stays_there():
-    crowd = Crowd(8 * 3600.0)
-    assert crowd.after({}) == crowd, "cars are not observed"
-    for in_view, met in ((0, 0), (1, 1), (1, 1), (2, 2), (0, 2), (1, 3)):
-        crowd = crowd.after({"cars": np.array([[0, in_view], [0, 0]], np.int8)})
-        assert crowd.met == met
-
-
-def test_rivals_take_the_best_slots_first_and_all_find_one():
-    n, per_s = 60, 0.02
-    p_free, leaving = np.full(n, 0.4), np.full(n, 1.0 / 1800.0)
-    order = np.random.default_rng(0).permutation(n)
-    rates = _take_rates(p_free, leaving, order, per_s, PASSED)
-    assert (np.diff(rates[order]) < 0.0).all(), "the best first"
-    free = 1.0 / (1.0 / p_free + rates / leaving)
-    assert (free * rates).sum() == pytest.approx(per_s, rel=0.1), "as many park as arrive"
-    assert not _take_rates(p_free, np.zeros(n), order, per_s, PASSED).any(), "nothing ever changes"
-
-
 def test_rivals_take_the_best_slots_whatever_is_observed_of_one():
     n = 40
     belief = SlotBelief.of_forecast(np.full(n, 0.6), np.full(n, 1e-3))
@@ -120,19 +99,6 @@ def test_rivals_take_the_best_slots_whatever_is_observed_of_one():
     )
 
 
-def test_free_slots_near_the_entry_do_not_prove_that_nobody_wants_the_best_ones():
-    scenario = make_scenario("campus")
-    agent = make_agent("belief-rivals", scenario, arrivals_per_hour=200)
-    observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=1)
-    belief = SlotBelief.of_observation(observation)
-    best, worst = agent._order[:20], agent._order[-40:]
-    _, memory = agent.predict(
-        {**observation, **belief.update(worst, np.zeros(len(worst), bool)).to_observation()}
-    )
-    known = belief.update(worst, np.zeros(len(worst), bool))
-    assert memory.day.p_occupied(known.time)[best].min() > 0.8
-
-
 def test_drivers_who_know_the_same_make_tours_of_their_own():
     scenario = make_scenario("campus")
     observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=1)
@@ -142,7 +108,7 @@ def test_drivers_who_know_the_same_make_tours_of_their_own():
         for later_s in range(8):
             driver = {**observation, "time": observation["time"] + np.array([later_s, 0.0], np.float32)}
             action, memory = agent.predict(driver)
-            tours[name].add(agent.plan_preview(driver, int(action), memory).path)
+            tours[name].add(agent.plan_preview(driver, int(action), memory))
     assert len(tours["belief"]) == 1
     assert len(tours["belief-rivals"]) >= 4
 

@@ -14,7 +14,7 @@ from parkenv.studies.statistics import mean_interval
 from planners import make_agent
 from planners.belief.agent import WORK_PER_MS
 from planners.belief.best_path import best_path
-from planners.belief.planning_graph import MOST_STOPS, detects_missed
+from planners.belief.planning_graph import MOST_STOPS
 from planners.bounds.exact import ExactSolution
 
 
@@ -66,12 +66,6 @@ def totals_s(scenario, agent, n, options=None):
 
 
 # --- the environment ---------------------------------------------------------------------------------
-
-
-def test_equal_seeds_give_equal_searches():
-    scenario = make_scenario("campus")
-    runner = EpisodeRunner(scenario, "belief", make_agent("belief", scenario))
-    assert runner.run(3).row == runner.run(3).row == search(scenario, 3)
 
 
 def choices(scenario, monkeypatch, seed=1, **options):
@@ -132,23 +126,6 @@ def test_it_looks_at_all_of_a_full_lot_again_and_again():
         observation, *_ = env.step(action)
         path.append(int(observation["vertex"]))
     assert min(len(set(path[i : i + 150])) for i in (150, 300, 450)) > 80
-
-
-def test_knowing_the_day_helps_the_planner_of_the_thesis_too():
-    plain, learning = (totals_s(make_scenario("jam"), "mdp", 40, {"day": day}) for day in (False, True))
-    assert mean_interval(learning - plain)[2] < -20.0
-
-
-@pytest.mark.parametrize("level", [0.3, 0.7])
-def test_doubt_costs_nothing_where_cars_drive_past_what_is_free(level):
-    """A free slot far from the goal is driven past, so having come so far does not mean that it was taken."""
-    scenario = at_occupancy(make_scenario("campus"), level)
-    observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=5)
-    expected = []
-    for day in (False, True):
-        _, memory = make_agent("belief", scenario, day=day).predict(observation)
-        expected.append(memory.expected_s)
-    assert expected[1] == pytest.approx(expected[0], rel=0.02)
 
 
 # --- adverse cases ---------------------------------------------------------------------------
@@ -226,13 +203,6 @@ def test_it_does_not_circle_among_taken_slots(seed):
     assert search(make_scenario("jam"), seed)["total_s"] < 400.0
 
 
-def test_looks_that_err_cost_tries_but_do_not_trap_it():
-    scenario = make_scenario("campus", sensor_model=SensorModel(hit_rate=0.9, false_alarm_rate=0.1))
-    rows = [search(scenario, seed) for seed in range(4)]
-    assert all(row["parked"] for row in rows)
-    assert max(row["failed_parks"] for row in rows) <= 5
-
-
 @pytest.mark.parametrize(("name", "value"), [("budget_ms", 0.0), ("doubt", 1.1), ("event", -0.1)])
 def test_bad_options_are_refused(name, value):
     with pytest.raises(InputError, match=f"{name} is {value}"):
@@ -244,13 +214,6 @@ def hidden_lots(name, seen_rate, occupancy=None):
     bands = tuple(SensorBand(6.0, beside, seen_rate, 1.0, 0.0) for beside in (False, True))
     scenario = make_scenario(name).replace(sensor_model=SensorModel(bands=bands))
     return scenario if occupancy is None else at_occupancy(scenario, occupancy)
-
-
-@pytest.mark.parametrize("seen_rate", [0.5, 0.9])
-def test_a_slot_that_stays_hidden_is_not_looked_for_for_ever(seen_rate):
-    rows = Case(hidden_lots("campus", seen_rate, 0.9), "belief").run(range(12))
-    assert all(row["parked"] for row in rows)
-    assert max(row["drive_s"] for row in rows) < 200.0
 
 
 @pytest.mark.parametrize("seen_rate", [0.3, 0.5])
@@ -276,12 +239,3 @@ def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than
         )
     assert len(kept) > 10
     assert all(onward_s <= remaining_s for remaining_s, onward_s in kept)
-
-
-def test_views_show_what_worse_ones_missed():
-    """A view makes out all that one with a lower rate does; of what a better one missed it shows nothing."""
-    assert detects_missed(1.0, 0.0)
-    assert detects_missed(1.0, 0.9)
-    assert not detects_missed(0.9, 0.9)
-    assert not detects_missed(1.0, 1.0)
-    assert not detects_missed(0.3, 0.0), "likelier not to"

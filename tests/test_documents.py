@@ -112,11 +112,12 @@ FEWER = {
     r"DECISIONS, TASKS = 20_000, 50": "DECISIONS, TASKS = 1_100, 2",
     r"(DECISIONS, EPOCHS, BATCH) = 2_000, 8": r"\1 = 50, 2",
     r"WORLDS = 40": "WORLDS = 2",
+    r"SCENES, DEADLINE_S = 10, 3.0": "SCENES, DEADLINE_S = 1, 1.0",
     r"model.learn\(4_096\)\n    observations": "model.learn(1_024)\n    observations",
 }
 """What is done often on a page or in an example, and how it is done less often here: the same code runs."""
 
-NEEDS = {"examples/pomdp_py_agents.py": "pomdp_py"}
+NEEDS = {"examples/pomdp_py_agents.py": "pomdp_py", "examples/shorten_drives.py": "casadi"}
 """Libraries of others, in no extra that the tests need, without which an example cannot run."""
 
 

@@ -24,7 +24,6 @@ from parkenv.studies.episodes import EpisodeRunner
 from parkenv.world.occupancy.day_error import DayError
 from planners import make_agent
 from planners.bounds.exact import ExactSolution
-from planners.routes import DriveRoutes
 
 BLIND = SensorModel(view_range=0.0)
 
@@ -109,7 +108,7 @@ def brute_force(problem, p, entry):
     return value(entry, frozenset(), frozenset())
 
 
-@pytest.mark.parametrize("seed", range(0, 108, 7))
+@pytest.mark.parametrize("seed", range(0, 108, 9))
 def test_the_reductions_lose_nothing(seed):
     problem, p, entry = small_lot(seed, shapes=((2, 3), (1, 6), (3, 2)))
     assert ExactSolution(problem, p, entry).expected_s == pytest.approx(
@@ -134,7 +133,7 @@ def test_the_mean_of_searches_in_the_environment_is_the_expectation():
     scenario = Scenario(name="lasting", lot=lot, occupancy=lasting, give_up_s=300.0)
     entry = int(lot.entry_vertices[0])
     runner = EpisodeRunner(scenario, "exact", make_agent("exact", scenario))
-    totals = np.array([runner.run(seed).row["total_s"] for seed in range(600)])
+    totals = np.array([runner.run(seed).row["total_s"] for seed in range(300)])
     expected = ExactSolution(scenario, np.full(lot.n_slots, 0.6), entry).expected_s
     assert abs(totals.mean() - expected) < 4.0 * totals.std() / np.sqrt(len(totals))
 
@@ -143,18 +142,9 @@ def test_the_agent_copes_with_cars_that_come_and_go():
     scenario = make_scenario("mini")
     busy = scenario.replace(occupancy=scenario.occupancy.at_mean_occupancy(0.9, 10 * 3600.0))
     runner = EpisodeRunner(busy, "exact", make_agent("exact", busy))
-    rows = [runner.run(seed).row for seed in range(40)]
+    rows = [runner.run(seed).row for seed in range(20)]
     assert all(row["parked"] or row["gave_up_s"] > 0.0 for row in rows)
     assert not any(row["truncated"] for row in rows)
-
-
-def test_a_certain_lot_is_a_shortest_way():
-    problem, p, entry = small_lot(3)
-    certain = np.ones(len(p))
-    certain[4] = 0.0
-    way = DriveRoutes(problem).seconds_from(entry)[4] + problem.arrival_cost_s[4]
-    assert ExactSolution(problem, certain, entry).expected_s == pytest.approx(way)
-    assert expected_time(make_agent("exact", problem), problem, certain, entry) == pytest.approx(way)
 
 
 def test_what_is_too_large_or_uncertain_is_refused_with_the_limit():

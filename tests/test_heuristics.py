@@ -86,7 +86,7 @@ def random_belief(rng, problem):
 @pytest.mark.parametrize("name", NAMES)
 def test_agents_decide_as_the_definition_of_their_rule(name):
     rng, decisions = np.random.default_rng(1), 0
-    for seed in range(40):
+    for seed in range(20):
         problem = small_lot(seed)[0]
         if seed % 10 == 9:
             problem = SearchProblem(lot=cut_in_two())
@@ -100,7 +100,7 @@ def test_agents_decide_as_the_definition_of_their_rule(name):
                 target = reference_target(name, problem, routes, belief, vertex, target)
                 action = agent.decide({"vertex": vertex}, belief, memory)
                 assert memory.target == target
-                path = (vertex, *agent.plan_preview({"vertex": vertex}, action, memory).path)
+                path = (vertex, *agent.plan_preview({"vertex": vertex}, action, memory))
                 assert path[-1] == target
                 assert drive_s(problem, path) == pytest.approx(routes.seconds_from(vertex)[target])
                 assert problem.lot.neighbors[vertex, action] == path[1] if len(path) > 1 else action == PARK
@@ -108,7 +108,7 @@ def test_agents_decide_as_the_definition_of_their_rule(name):
                 if action == PARK:
                     break
                 vertex = int(problem.lot.neighbors[vertex, action])
-    assert decisions > 2000
+    assert decisions > 1000
 
 
 # ---- the rule of places
@@ -147,7 +147,7 @@ def test_usual_heads_for_the_place_of_the_lowest_index():
         memory = agent.begin({"vertex": vertex}, belief)
         action = agent.decide({"vertex": vertex}, belief, memory)
         assert indices[memory.target] == pytest.approx(min(indices.values()))
-        path = (vertex, *agent.plan_preview({"vertex": vertex}, action, memory).path)
+        path = (vertex, *agent.plan_preview({"vertex": vertex}, action, memory))
         assert path[-1] == memory.target
         assert drive_s(problem, path) == pytest.approx(seconds[memory.target])
 
@@ -212,7 +212,7 @@ def random_world(seed):
 @pytest.mark.parametrize("name", COMPILED)
 def test_a_compiled_policy_decides_as_its_agent_in_every_situation(name):
     decisions = 0
-    for seed in range(48):
+    for seed in range(24):
         scenario, demand, kind, options = random_world(seed)
         runs = []
         for policy in (POLICIES[name], None):
@@ -226,7 +226,7 @@ def test_a_compiled_policy_decides_as_its_agent_in_every_situation(name):
         for field in ("slot", "state", "ended_at", "n_steps", "failed_parks"):
             np.testing.assert_array_equal(compiled.cars[field], planned.cars[field])
         decisions += int(compiled.totals["decisions"])
-    assert decisions > 5000
+    assert decisions > 2500
 
 
 def test_a_policy_takes_the_options_of_its_agent():

@@ -10,7 +10,7 @@ from stable_baselines3 import DQN, PPO
 
 from parkenv import InputError, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.network import NetworkPolicy
+from parkenv.engine.network import compiled_network
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import network_policy, policy_of
@@ -69,6 +69,6 @@ def test_drawn_actions_have_the_probabilities_of_the_policy():
 
 def test_layers_that_do_not_fit_are_named():
     with pytest.raises(InputError, match="want a chain from 91 numbers to 5"):
-        NetworkPolicy([(np.zeros((5, 7), np.float32), np.zeros(5, np.float32))])
+        compiled_network([(np.zeros((5, 7), np.float32), np.zeros(5, np.float32))])
     with pytest.raises(InputError, match="activation is 'elu'"):
-        NetworkPolicy([(np.zeros((5, 91), np.float32), np.zeros(5, np.float32))], activation="elu")
+        compiled_network([(np.zeros((5, 91), np.float32), np.zeros(5, np.float32))], activation="elu")

@@ -4,7 +4,6 @@ import gymnasium as gym
 import networkx as nx
 import numpy as np
 import pytest
-from small_lots import CAR_PARKS
 
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
@@ -172,12 +171,6 @@ def test_it_is_computed_from_observations_alone(sensor):
     replay = LocalObservation(Replay(env, recorded), K)
     replayed = [replay.reset()[0], *(replay.step(0)[0] for _ in recorded[1:])]
     np.testing.assert_array_equal([observation["local"] for observation in replayed], local)
-
-
-def test_it_has_the_same_size_on_every_lot():
-    for name in CAR_PARKS:
-        env = LocalObservation(gym.make("parkenv/Search-v2", scenario=name), 7)
-        assert env.observation_space["local"].shape == (FIRST_NEAR + PER_NEAR * 7,)
 
 
 def test_a_lot_smaller_than_k_is_told_of_as_far_as_it_goes():

@@ -203,25 +203,6 @@ def test_days_unlike_their_forecast_have_their_slots_from_the_belief_about_the_d
     assert all_taken[0] < all_taken[1]
 
 
-def test_belief_as_the_base_of_rollouts_is_left_only_for_what_is_surely_better():
-    env, _ = searching(name="mini", day_error=0.8)
-    scenario = env.unwrapped.scenario
-    takes = {}
-    for name, options in (
-        ("belief", {}),
-        *[("rollout", {"base": "belief", "simulations": 48, "any_day": True})] * 2,
-        ("rollout", {"base": "belief", "simulations": 12, "ahead": 0}),
-    ):
-        agent = make_agent(name, scenario, **options)
-        total_s = [parkenv.simulate(env, agent, seed=seed).info["total_s"] for seed in range(8)]
-        takes.setdefault((name, options.get("ahead")), []).append(total_s)
-    (alone,), (first, again), (to_the_end,) = takes.values()
-    assert first == again
-    for total_s in (first, to_the_end):
-        assert np.median(np.abs(np.subtract(total_s, alone))) == 0.0, "it is level with it in most searches"
-        assert np.mean(total_s) < np.mean(alone) + 5.0
-
-
 def test_a_copy_of_a_search_moves_on_without_it():
     env, _ = searching(name="mini", day_error=0.8)
     agent = make_agent("belief", env.unwrapped.scenario)

@@ -12,8 +12,8 @@ from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv.driving.crossings import Crossing, CrossingTraffic, caused_contact
 from parkenv.driving.levels import level_scene
+from parkenv.driving.road_users import Crossing, CrossingTraffic, caused_contact
 from parkenv.driving.scene_files import read_scene
 from parkenv.driving.vehicle import TPCAP, VEHICLES, VehicleParameters, placed
 from parkenv.errors import InputError
@@ -81,7 +81,7 @@ def test_a_car_waits_for_others_that_it_would_touch(monkeypatch):
         states, others = drive(scene, path, TrackingSettings())
         assert Manoeuvre(scene, path, states, 0.0, others).judged.driven
         with monkeypatch.context() as patch:
-            patch.setattr(manoeuvre, "_has_to_wait", lambda *_: False)
+            patch.setattr(manoeuvre, "is_blocked", lambda *_: False)
             states, others = drive(scene, path, TrackingSettings())
             hit += Manoeuvre(scene, path, states, 0.0, others).judged.contact
     assert hit >= 1

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from command_line import parkenv as command
 from small_lots import features
-from value_iteration import value_iteration
 
 from parkenv import OccupancyProcess, ParkingLot, Scenario
 from parkenv.lots import packaged_lot, write_lot
@@ -76,7 +75,6 @@ def test_solvers_agree_on_priced_slots(gamma):
     p_occupied = rng.uniform(0.0, 1.0, lot.n_slots)
     mdp = ParkingMDP.from_belief(problem, p_occupied, failure_s=10.0, gamma=gamma)
     by_labels = label_setting(mdp)
-    np.testing.assert_allclose(by_labels.values, value_iteration(mdp).values, atol=1e-5)
     if gamma < 1.0:
         np.testing.assert_allclose(by_labels.values, policy_iteration(mdp).values, atol=1e-6)
     else:

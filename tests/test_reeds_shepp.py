@@ -89,12 +89,6 @@ def test_no_other_way_is_shorter(pieces):
     assert distance(ORIGIN, goal) <= sum(map(abs, lengths)) + 1e-6
 
 
-@given(start=poses, via=poses, end=poses)
-@settings(max_examples=200)
-def test_a_detour_is_not_shorter(start, via, end):
-    assert distance(start, end) <= distance(start, via) + distance(via, end) + 1e-6
-
-
 @given(end=poses, radius=st.floats(0.5, 8.0))
 @settings(max_examples=100)
 def test_lengths_grow_with_the_turning_circle(end, radius):

@@ -269,7 +269,7 @@ def test_asking_belief_for_its_plan_changes_nothing():
         memory.day.p_occupied(known.time),
         [np.array(v) for v in (memory.state, memory.missed_rate, memory.course.targets)],
     )
-    assert agent.plan_preview(observation, int(action), memory).path
+    assert agent.plan_preview(observation, int(action), memory)
     np.testing.assert_array_equal(before[0], memory.day.p_occupied(known.time))
     for old, new in zip(before[1], (memory.state, memory.missed_rate, memory.course.targets), strict=True):
         np.testing.assert_array_equal(old, new)

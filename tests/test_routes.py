@@ -7,9 +7,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv import InputError, Lane, ParkingLot, make_scenario
-from parkenv.belief.slot_belief import SlotBelief
 from parkenv.lots import city_lot, grid_lot, packaged_lot
-from planners import make_agent
 from planners.routes import DriveRoutes
 
 LOTS = {name: packaged_lot(name) for name in ("campus", "street")} | {
@@ -75,14 +73,3 @@ def test_what_no_way_leads_to_is_left_out():
         with pytest.raises(InputError, match="no route"):
             routes.move_toward(vertex, target)
     assert list(routes.hops(1, 1)) == []
-
-
-@pytest.mark.parametrize("name", ["greedy-goal", "greedy-drive", "first-free"])
-def test_agents_head_for_what_they_can_reach(name):
-    """The slot with the shorter walk lies behind the entry, on a one-way lane."""
-    lot = one_way_past_two_slots()
-    agent, vertex = make_agent(name, make_scenario(lot)), int(lot.entry_vertices[0])
-    belief = SlotBelief.of_forecast(np.full(2, 0.5), np.zeros(2))
-    observation = {"vertex": vertex, "time": np.zeros(2), **belief.to_observation()}
-    move, _ = agent.predict(observation)
-    assert lot.neighbors[vertex, int(move)] == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import webbrowser
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +22,6 @@ from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentSpec, classes_in
 from parkenv.studies.fields import TRAFFIC, Agents, OneScenario, Seed
 from parkenv.studies.study import ExecutionSpec, ReportOptions
-from planners.names import ALGORITHMS
 
 Trust = Annotated[
     bool,
@@ -30,14 +29,6 @@ Trust = Annotated[
     Field(
         description="Run the classes (MODULE:CLASS) and use the cluster named by the file or the folder of "
         "the run."
-    ),
-]
-TrustModel = Annotated[
-    bool,
-    Option(panel="Trust"),
-    Field(
-        description="Convert archives of stable-baselines3 (ALGORITHM:FILE.zip) to model files; this runs the code in "
-        "them."
     ),
 ]
 
@@ -55,20 +46,6 @@ def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] 
     if sys.stdin.isatty() and typer.confirm(f"{source} runs {shown}. Run this code?"):
         return
     raise InputError(f"{source}: would run {shown}; read that code, then add --trust")
-
-
-def readable_models(agents: Sequence[str]) -> list[str]:
-    """Return the agents, with archives of stable-baselines3 converted to model files; this runs the code in them."""
-    readable = list(agents)
-    for i, agent in enumerate(agents):
-        algorithm, _, file = agent.partition(":")
-        if algorithm in ALGORITHMS and file.endswith(".zip"):
-            from planners.model_file import convert_archive
-
-            converted = convert_archive(algorithm, file)
-            typer.echo(f"Converted: {converted}; from now on, name that file")
-            readable[i] = f"{algorithm}:{converted}"
-    return readable
 
 
 class Report(Command, ExecutionSpec, ReportOptions):

@@ -10,12 +10,11 @@ from pydantic import create_model
 from typer import echo
 
 from parkenv.cli.options import Command, Given, command_class, field_options, spec_of
-from parkenv.cli.report import Trust, TrustModel, make_report, readable_models, require_trust
+from parkenv.cli.report import Trust, make_report, require_trust
 from parkenv.cli.tables import command_line, make_console, print_table, stages
 from parkenv.errors import InputError, ensure, nearest
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Option, option
-from parkenv.studies.agent_spec import split_agents
 from parkenv.studies.results import SPEC_FILE, without_nan
 from parkenv.studies.runner import Interrupted, run
 from parkenv.studies.study import STUDIES, ExecutionSpec, Study, read_study, schemas, study_class
@@ -52,8 +51,6 @@ class StudyCommand(RunCommand):
     @classmethod
     def of(cls, given: Given) -> Self:
         """See `Command`: options change the study, which with --resume is the one in the folder."""
-        if "--agents" in given and "--trust-model" in given:
-            given = {**given, "--agents": ",".join(readable_models(split_agents(given["--agents"])))}
         options = [option for option in field_options(cls) if option.name in given]
         command = spec_of(
             cls, {option.name: given[option.name] for option in options if len(option.path) == 1}
@@ -112,8 +109,7 @@ def study_command(kind: str) -> type[StudyCommand]:
     study = study_class(kind)
     base: Any = command_class(f"study_commands:{WITH_MORE[kind]}") if kind in WITH_MORE else StudyCommand
     out = option(None, f"Folder for {study.writes}.", short="-o", default=str(study.folder({})))
-    trust: Any = {"trust_model": (TrustModel, False)} if "agents" in study.model_fields else {}
-    fields: Any = {"study": (study, study()), "out": (Path | None, out)} | trust
+    fields: Any = {"study": (study, study()), "out": (Path | None, out)}
     model: Any = create_model(study.__name__, __base__=base, __doc__=study.__doc__, **fields)
     made = cast("type[StudyCommand]", model)
     made.examples = study.examples

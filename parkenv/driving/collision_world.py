@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters
-from parkenv.errors import InputError
 
 
 class ObstacleKind(IntEnum):
@@ -36,6 +35,15 @@ _EGO = 100
 _OTHERS = 1  # group of all other shapes, which are not checked against each other
 
 
+def padded(outlines: Sequence[FloatArray]) -> FloatArray:
+    """Outlines as one array, (n, k, 2) m; shorter ones repeat their last corner."""
+    corners = np.empty((len(outlines), max(map(len, outlines), default=2), 2))
+    for row, outline in zip(corners, outlines, strict=True):
+        row[: len(outline)] = outline
+        row[len(outline) :] = outline[-1]
+    return corners
+
+
 @dataclass(frozen=True, eq=False)
 class Obstacles:
     """Static obstacles around a car; world frame."""
@@ -46,40 +54,17 @@ class Obstacles:
     n_corners: IntArray  # (n,) int64, 2 to k_max
     kind: IntArray  # (n,) int64, an `ObstacleKind` each
 
-    def __post_init__(self) -> None:
-        corners = np.array(self.corners, dtype=np.float64)
-        count, kind = (np.array(a, dtype=np.int64) for a in (self.n_corners, self.kind))
-        if corners.ndim != 3 or corners.shape[2] != 2 or not count.shape == kind.shape == corners.shape[:1]:
-            raise InputError(
-                f"obstacles: corners {corners.shape}, n_corners {count.shape}, kind {kind.shape}, want (n, k, 2), "
-                "(n,) and (n,)"
-            )
-        if not np.isfinite(corners).all():
-            raise InputError("obstacles: a corner is not finite, want numbers")
-        if len(count) and (count.min() < 2 or count.max() > corners.shape[1]):
-            raise InputError(
-                f"obstacles: n_corners {count.min()} to {count.max()}, want 2 to {corners.shape[1]}"
-            )
-        for name, values in (("corners", corners), ("n_corners", count), ("kind", kind)):
-            values.flags.writeable = False
-            object.__setattr__(self, name, values)
-
     def __len__(self) -> int:
         return len(self.kind)
 
     @classmethod
     def of(cls, outlines: Sequence[tuple[ObstacleKind, FloatArray]]) -> Self:
         """Create obstacles from pairs of kind and outline, (k, 2) m."""
-        k_max = max((len(outline) for _, outline in outlines), default=2)
-        corners = np.empty((len(outlines), k_max, 2))
-        for row, (_, outline) in zip(corners, outlines, strict=True):
-            row[: len(outline)] = outline
-            row[len(outline) :] = outline[-1]
+        corners = padded([outline for _, outline in outlines])
         count = np.array([len(outline) for _, outline in outlines], dtype=np.int64)
-        return cls(corners, count, np.array([int(kind) for kind, _ in outlines], dtype=np.int64))
+        return cls(corners, count, np.array([kind for kind, _ in outlines], dtype=np.int64))
 
     def only(self, *kinds: ObstacleKind) -> Self:
-        """Return the obstacles of the given kinds."""
         chosen = np.isin(self.kind, kinds)
         return type(self)(self.corners[chosen], self.n_corners[chosen], self.kind[chosen])
 
@@ -92,12 +77,8 @@ class CollisionWorld:
     """A pymunk space with a car, static obstacles and moving ones, for collision queries.
 
     Poses are set, not simulated: the car follows its own kinematics (`parkenv.driving.vehicle`). The car is longer
-    than twice the distance of any step, so it cannot pass an obstacle between two steps.
-
-    Args:
-        vehicle: the car.
-        obstacles: static obstacles.
-        movers: kind and outline, (k, 2) m in its own frame, of each moving obstacle.
+    than twice the distance of any step, so it cannot pass an obstacle between two steps. Outlines of `movers` are
+    (k, 2) m in their own frames.
     """
 
     def __init__(
@@ -125,16 +106,9 @@ class CollisionWorld:
                 self.space.on_collision(_EGO, int(kind), pre_solve=self._touch, data=int(kind))
 
     def touched(self, x: float, y: float, yaw: float) -> int:
-        """Place the car at a pose of its rear axle, m and rad; return the `ObstacleKind` that it touches.
-
-        Args:
-            x: x of the middle of the rear axle, m.
-            y: y of the middle of the rear axle, m.
-            yaw: yaw, rad.
-        """
-        car = self.car
-        car.position = x, y
-        car.angle = yaw
+        """Place the car at a pose of its rear axle, m and rad; return the `ObstacleKind` that it touches."""
+        self.car.position = x, y
+        self.car.angle = yaw
         self._touched = 0
         self.space.step(PHYSICS_S)
         return self._touched

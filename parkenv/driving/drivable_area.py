@@ -1,7 +1,8 @@
-"""The paved area of a lot, its kerbs and walls."""
+"""The paved area of a lot, its kerbs and walls, and the parked cars around one that drives through it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 
 import numpy as np
@@ -9,26 +10,26 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.driving.collision_world import ObstacleKind, Obstacles
 from parkenv.world.drive_graph import SLOT_REACH, linestrings
-from parkenv.world.lot import ParkingLot, mouth_heading
+from parkenv.world.lot import Mouth, ParkingLot, mouth_heading
+from parkenv.world.lot_scene import LotScenes, slot_lot
+from parkenv.world.occupancy.process import World
+from parkenv.world.scenario import Scenario
 
 ROAD_HALF_WIDTH = 3.0  # from the centre line of a lane without slots to its kerbs, m
 HALF_WIDTHS = (2.0, 4.0)
 """Limits, m, of half the width of a lane with slots, which extends to the slots' mouths."""
 JOINT = 0.6  # gaps between slots of up to twice this width, m, are paved
 STRAIGHTENED = 0.03  # tolerance, m, for simplifying kerbs
-
-
+REACH_M = 25.0  # distance, m along both axes, from the car beyond which obstacles are left out
+OVERHANG_M = 0.25  # distance, m, by which parked cars may protrude from their slots at the mouth
 JOINED_WHOLE = 2000
 """Slots up to which the whole paved area is computed at once; the union of a town takes ten seconds."""
 
 
 class DrivableArea:
-    """The paved area of a lot: lanes up to the mouths of their slots, slots, and the approaches to them.
-
-    Args:
-        lot: the lot.
-    """
+    """The paved area of a lot: lanes up to the mouths of their slots, slots, and the approaches to them."""
 
     def __init__(self, lot: ParkingLot) -> None:
         self._lot = lot
@@ -95,3 +96,58 @@ class DrivableArea:
             for start, end in pairwise(shapely.get_coordinates(line))
         ]
         return np.array(pieces).reshape(-1, 2, 2)
+
+
+class LotObstacles:
+    """Static obstacles in one world of a scenario.
+
+    The parked cars are the same as in the sensors' scene (`parkenv.world.lot_scene`).
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        lot = scenario.lot
+        self.slots = slot_lot(lot)
+        self._area = DrivableArea(lot)
+        self._still: dict[tuple[int, int], list[tuple[ObstacleKind, FloatArray]]] = {}
+        heading = np.stack([np.cos(lot.slot_yaw), np.sin(lot.slot_yaw)], axis=1)
+        out = np.where(lot.slot_mouth == Mouth.REAR, OVERHANG_M, 0.0)[:, None] * heading
+        self._boxes = lot.slot_corners()
+        self._boxes[:, [0, 3]] -= out[:, None]
+
+    def begin(self, key: np.uint64, world: World) -> None:
+        self._scenes = LotScenes(self.slots, self._scenario, key, world)
+
+    def taken(self, center: FloatArray, time: float) -> list[int]:
+        """Return the occupied slots within `REACH_M` of a point, (2,) m, at a time, s; ascending."""
+        model = self._scenes.at(time).vehicle_model
+        return [i for i in self._near(center) if model[i] >= 0]
+
+    def at_time(self, center: FloatArray, time: float, slots: Iterable[int]) -> Obstacles:
+        """Return the cars in the occupied `slots` at `time`, s, and kerbs and walls around a point, (2,) m."""
+        cars = [(ObstacleKind.PARKED_CAR, self.footprint(i, time)) for i in slots]
+        return Obstacles.of([*cars, *self.kerbs_and_walls(center)])
+
+    def footprint(self, slot: int, time: float) -> FloatArray:
+        return self._scenes.at(time).footprint(slot)
+
+    def worst_case(self, center: FloatArray) -> Obstacles:
+        """As `at_time`, with all slots occupied: a path clear of these obstacles is clear at any time."""
+        boxes = [(ObstacleKind.PARKED_CAR, self._boxes[i]) for i in self._near(center)]
+        return Obstacles.of([*boxes, *self.kerbs_and_walls(center)])
+
+    def kerbs_and_walls(self, center: FloatArray) -> list[tuple[ObstacleKind, FloatArray]]:
+        """Return the kerbs and walls near a point, computed per grid cell of 10 m."""
+        column, row = np.round(center / 10.0).astype(int).tolist()
+        if (column, row) not in self._still:
+            middle = 10.0 * np.array([column, row])
+            reach = REACH_M + 5.0
+            self._still[column, row] = [
+                *((ObstacleKind.KERB, line) for line in self._area.kerbs(middle, reach)),
+                *((ObstacleKind.WALL, line) for line in self._area.walls(middle, reach)),
+            ]
+        return self._still[column, row]
+
+    def _near(self, center: FloatArray) -> list[int]:
+        near = np.abs(self._scenario.lot.slot_xy - center).max(axis=1) <= REACH_M
+        return [int(i) for i in np.flatnonzero(near)]

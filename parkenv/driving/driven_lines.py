@@ -34,7 +34,6 @@ class DrivenLine:
 
     @property
     def length(self) -> float:
-        """Length, m."""
         return float(self.station[-1])
 
     @cached_property
@@ -75,25 +74,17 @@ class DrivenEdge:
 
 
 class DrivenLines:
-    """All driven lines of a lot.
-
-    Args:
-        lot: the lot.
-
-    Attributes:
-        lines: one per direction: each lane in the order of its points, two-way lanes also in reverse order.
-    """
+    """All driven lines of a lot: each lane in the order of its points, two-way lanes also in reverse order."""
 
     def __init__(self, lot: ParkingLot) -> None:
         self._lot = lot
         self._centers: list[FloatArray] = []
         self.lines: list[DrivenLine] = []
         for lane in lot.lanes:
+            offset = 0.0 if lane.oneway else lot.side * KEPT_RIGHT_M
             for points in (lane.points,) if lane.oneway else (lane.points, lane.points[::-1]):
                 self._centers.append(points)
-                self.lines.append(
-                    DrivenLine(_offset_line(points, 0.0 if lane.oneway else lot.side * KEPT_RIGHT_M))
-                )
+                self.lines.append(DrivenLine(_offset_line(points, offset)))
         self._aside = np.array([abs(LANE_OFFSET - KEPT_RIGHT_M) * (not lane.oneway) for lane in lot.lanes])
         self._aside = np.repeat(self._aside, [1 if lane.oneway else 2 for lane in lot.lanes])
         self._middles = np.array([shapely.LineString(points) for points in self._centers])
@@ -101,13 +92,7 @@ class DrivenLines:
         self._stations: dict[int, list[tuple[int, float]]] = {}
 
     def edge(self, source: int, target: int, length: float) -> DrivenEdge:
-        """Find the edge between two vertices.
-
-        Args:
-            source: vertex where it starts.
-            target: vertex where it ends.
-            length: its length in the graph, m.
-        """
+        """Find the edge between two vertices; `length` is its length in the graph, m."""
         ends = self._on_lines(target)
         along = [
             (abs(end - start - length), line, start, end)
@@ -132,23 +117,20 @@ class DrivenLines:
         )
 
     def _on_lines(self, vertex: int) -> list[tuple[int, float]]:
-        """Return the lines that pass a vertex, and its station on each, m."""
         if vertex not in self._stations:
             lot = self._lot
             xy = lot.vertex_xy[vertex]
             point = shapely.Point(xy)
             if vertex < lot.n_slots:
-                near = np.flatnonzero(
-                    np.abs(shapely.distance(self._sides, point) - self._aside) < _ON_LINE
-                ).tolist()
+                away = np.abs(shapely.distance(self._sides, point) - self._aside)
+                near = np.flatnonzero(away < _ON_LINE).tolist()
                 heading = lot.vertex_yaw[vertex]
-                found = [(k, self.lines[k].station_of(xy)) for k in near]
-                found = [at for at in found if math.cos(self.lines[at[0]].pose(at[1])[2] - heading) > 0.7]
+                places = [(k, self.lines[k].station_of(xy)) for k in near]
+                places = [at for at in places if math.cos(self.lines[at[0]].pose(at[1])[2] - heading) > 0.7]
             else:
-                found = []
-                for k in np.flatnonzero(shapely.distance(self._middles, point) < 2 * NODE_TOLERANCE).tolist():
-                    found += [(k, station) for station in self._stations_near(k, xy)]
-            self._stations[vertex] = found
+                near = np.flatnonzero(shapely.distance(self._middles, point) < 2 * NODE_TOLERANCE).tolist()
+                places = [(k, station) for k in near for station in self._stations_near(k, xy)]
+            self._stations[vertex] = places
         return self._stations[vertex]
 
     def _stations_near(self, k: int, xy: FloatArray) -> list[float]:

@@ -15,7 +15,7 @@ import shapely
 from shapely.affinity import rotate, translate
 from shapely.geometry.base import BaseGeometry
 
-from parkenv.driving.crossings import CAR, Crossing
+from parkenv.driving.road_users import CAR, Crossing
 from parkenv.driving.scene import Contour, Scene
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError, nearest
@@ -34,7 +34,6 @@ class Level:
 
 
 def levels(vehicle: VehicleParameters) -> dict[str, Level]:
-    """Return the levels for a car, by name."""
     quarter = 0.25 * vehicle.length
     return {
         "normal": Level((quarter, quarter + 0.5), (0.85, 1.2), (4.5, 7.0), 3),
@@ -69,11 +68,8 @@ def _drawn(
 ) -> Scene | None:
     """Draw a scene; None if its parts overlap. The aisle is along x, the slots are below y = 0."""
     parallel = kind == "parallel"
-    angle = {
-        "perpendicular": math.pi / 2,
-        "oblique": rng.choice([math.pi / 4, math.pi / 3]),
-        "parallel": 0.0,
-    }[kind]
+    oblique = rng.choice([math.pi / 4, math.pi / 3])
+    angle = {"perpendicular": math.pi / 2, "oblique": oblique, "parallel": 0.0}[kind]
     margin = rng.uniform(*(level.along if parallel else level.across))
     aisle = level.aisle[0 if parallel else 1]
     half = 0.5 * np.array([vehicle.length, vehicle.width])
@@ -81,7 +77,6 @@ def _drawn(
     depth = car.bounds[3] - car.bounds[1]
 
     def parked(x: float) -> BaseGeometry:
-        """Return a car that is parked at x, a little askew."""
         askew = rotate(car, rng.normal(0.0, math.pi / 72), (0, 0), use_radians=True)
         return translate(askew, x, -0.5 * depth - 0.2 + np.clip(rng.normal(0.0, 0.1), -0.2, 0.2))
 
@@ -139,7 +134,6 @@ def _drawn(
 
 
 def _crossing(aisle: float, rng: np.random.Generator) -> Crossing:
-    """Draw a pedestrian or a car that comes through the aisle from either end, a pedestrian askew."""
     side = rng.choice([-1.0, 1.0])
     if rng.random() < 0.5:
         low, high = sorted((0.5 * CAR.width + 0.3, aisle - 0.5 * CAR.width - 0.3))

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Annotated, Any
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike
+from pydantic import AfterValidator, Field
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.drivable_area import DrivableArea
-from parkenv.driving.vehicle import STATE_SIZE, VehicleParameters, move_along, placed
+from parkenv.driving.vehicle import STATE_SIZE, VehicleParameters, finite_pose, move_along, placed
 from parkenv.errors import InputError
+from parkenv.files.field_types import Number, Probability, Validated
 from parkenv.world.drive_graph import LANE_OFFSET, linestrings
 from parkenv.world.lot import Mouth, ParkingLot
 from sim_sensors.slot_scenes import ParkingManners, SlotLot
 from sim_sensors.surroundings import Surroundings
 
 KINDS = ("perpendicular", "oblique", "parallel")  # orientation of a slot relative to its lane
+# Orientation of a car in a perpendicular or oblique slot; in a parallel slot it faces the direction of traffic.
 WAYS = ("nose-in", "back-in")
-"""Orientation of a car in a perpendicular or oblique slot; in a parallel slot it faces the direction of traffic."""
-STARTS = ("lane", "way-out")
 REACH = 30.0
 """Distance, m along both axes, from the slot's centre beyond which obstacles are not part of a task."""
 AREA = REACH - 3.0
@@ -36,6 +39,15 @@ _TRIES = 64
 _STEP = 0.1
 _MOST_KNOWN = 1 << 15
 _ARRIVALS = 16  # number of different cars and poses per slot
+
+
+def _one_of(*known: str) -> AfterValidator:
+    def checked(value: str) -> str:
+        if value not in known:
+            raise ValueError(", ".join(known))
+        return value
+
+    return AfterValidator(checked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +67,6 @@ class ParkingTask:
 
     def __post_init__(self) -> None:
         require_room(self.vehicle, self.size, f"slot {self.slot_id!r} of lot {self.lot!r}")
-        for name, length in (("slot", 3), ("target", 3), ("start", STATE_SIZE)):
-            values = np.array(getattr(self, name), dtype=np.float64)
-            if values.shape != (length,) or not np.isfinite(values).all():
-                raise InputError(f"parking task: {name} is {values.tolist()}, want {length} finite numbers")
-            values.flags.writeable = False
-            object.__setattr__(self, name, values)
 
     @cached_property
     def room(self) -> FloatArray:
@@ -76,7 +82,7 @@ class ParkingTask:
 
 
 @dataclass(frozen=True, eq=False)
-class ParkingTasks:
+class ParkingTasks(Validated):
     """Draw parking tasks on one lot; a task is a pure function of a key.
 
     Args:
@@ -106,33 +112,17 @@ class ParkingTasks:
 
     lot: ParkingLot
     vehicle: VehicleParameters = field(default_factory=VehicleParameters)
-    kinds: tuple[str, ...] | None = None
-    ways: tuple[str, ...] = WAYS
+    kinds: Annotated[tuple[Annotated[str, _one_of(*KINDS)], ...], Field(min_length=1)] | None = None
+    ways: Annotated[tuple[Annotated[str, _one_of(*WAYS)], ...], Field(min_length=1)] = WAYS
     slot: str | None = None
-    occupancy: float = 0.85
-    slack: float = 0.0
+    occupancy: Probability = 0.85
+    slack: Annotated[Number, Field(ge=0.0, le=REACH)] = 0.0
     distance: tuple[float, float] = (4.0, 14.0)
-    starts: str = "lane"
+    starts: Annotated[str, _one_of("lane", "way-out")] = "lane"
     manners: ParkingManners = field(default_factory=ParkingManners)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.lot, ParkingLot):
-            raise InputError(f"lot is a {type(self.lot).__name__}, want a ParkingLot")
-        if not isinstance(self.vehicle, VehicleParameters):
-            raise InputError(f"vehicle is a {type(self.vehicle).__name__}, want VehicleParameters")
-        for name, known in (("kinds", KINDS), ("ways", WAYS)):
-            words = getattr(self, name)
-            if words is None:
-                continue
-            object.__setattr__(self, name, tuple(words))
-            if isinstance(words, str) or not words or not set(words) <= set(known):
-                raise InputError(f"{name} is {words!r}, want some of {', '.join(known)}")
-        if self.starts not in STARTS:
-            raise InputError(f"starts is {self.starts!r}, want one of {', '.join(STARTS)}")
-        for name, most in (("occupancy", 1.0), ("slack", REACH)):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0.0 <= value <= most):
-                raise InputError(f"{name} is {value!r}, want 0 to {most:g}")
+        super().__post_init__()
         if len(self.distance) != 2 or not 0.0 <= self.distance[0] <= self.distance[1] <= FARTHEST:
             raise InputError(f"distance is {self.distance!r}, want least and greatest, 0 to {FARTHEST:g} m")
         if self.slot is not None and self.slot not in self.lot.slot_ids:
@@ -153,7 +143,6 @@ class ParkingTasks:
 
     @cached_property
     def _slots_by_kind(self) -> dict[str, list[int]]:
-        """Indices of the slots to draw from, by kind."""
         lot, vehicle = self.lot, self.vehicle
         if self.slot is not None:
             i = lot.slot_ids.index(self.slot)
@@ -161,9 +150,8 @@ class ParkingTasks:
             require_room(vehicle, size, f"slot {self.slot!r} of lot {lot.name!r}")
             chosen = [i]
         else:
-            chosen = np.flatnonzero(
-                (lot.slot_length >= vehicle.length) & (lot.slot_width >= vehicle.width)
-            ).tolist()
+            fits = (lot.slot_length >= vehicle.length) & (lot.slot_width >= vehicle.width)
+            chosen = np.flatnonzero(fits).tolist()
         choice: dict[str, list[int]] = {}
         for i in chosen:
             if self.kinds is None or self.slot_kinds[i] in self.kinds:
@@ -212,15 +200,11 @@ class ParkingTasks:
         obstacles = self._obstacles_around(i, rng)
         space = CollisionWorld(self.vehicle, obstacles)
         if start is None:
-            drawn = (
-                self._way_out(target, space, rng)
-                if self.starts == "way-out"
-                else self._on_lane(i, space, rng)
-            )
+            is_out = self.starts == "way-out"
+            drawn = self._way_out(target, space, rng) if is_out else self._on_lane(i, space, rng)
             if drawn is None:
                 raise InputError(
-                    f"slot {lot.slot_ids[i]!r} of lot {lot.name!r}: no start without a contact was found on the lane, "
-                    "want more room there"
+                    f"slot {lot.slot_ids[i]!r} of lot {lot.name!r}: no start without a contact was found"
                 )
         else:
             drawn = self._checked_start(start, slot, space)
@@ -242,14 +226,12 @@ class ParkingTasks:
         return {}
 
     def _outline(self, slot: int, arrival: int) -> FloatArray:
-        """Footprint, (k, 2) m, of a car in a slot."""
-        known = self._outlines
-        if (slot, arrival) not in known:
-            if len(known) >= _MOST_KNOWN:
-                known.clear()
+        if (slot, arrival) not in self._outlines:
+            if len(self._outlines) >= _MOST_KNOWN:
+                self._outlines.clear()
             pose, model = self.slot_cars.arrival(slot, arrival)
-            known[slot, arrival] = placed(self.slot_cars.fleet.models[model].footprint(), pose)
-        return known[slot, arrival]
+            self._outlines[slot, arrival] = placed(self.slot_cars.fleet.models[model].footprint(), pose)
+        return self._outlines[slot, arrival]
 
     def _obstacles_around(self, i: int, rng: np.random.Generator) -> Obstacles:
         """The obstacles around slot i, nearest first within each kind."""
@@ -271,10 +253,8 @@ class ParkingTasks:
             (ObstacleKind.KERB, self._area.kerbs(center, REACH)),
             (ObstacleKind.WALL, self._area.walls(center, REACH)),
         ):
-            order = np.argsort(
-                shapely.distance(shapely.Point(center), shapely.linestrings(lines)), kind="stable"
-            )
-            outlines += [(thing, line) for line in lines[order]]
+            away = shapely.distance(shapely.Point(center), shapely.linestrings(lines))
+            outlines += [(thing, line) for line in lines[np.argsort(away, kind="stable")]]
         return Obstacles.of(outlines)
 
     def _on_lane(self, i: int, space: CollisionWorld, rng: np.random.Generator) -> FloatArray | None:
@@ -321,12 +301,7 @@ class ParkingTasks:
         return np.array([x, y, yaw])
 
     def _checked_start(self, start: ArrayLike, slot: FloatArray, space: CollisionWorld) -> FloatArray:
-        try:
-            pose = np.array(start, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"start is {start!r:.60}, want x, y in m and yaw in rad") from error
-        if pose.shape != (3,) or not np.isfinite(pose).all():
-            raise InputError(f"start is {pose.tolist()}, want three finite numbers: x, y in m and yaw in rad")
+        pose = finite_pose("start", start)
         if np.abs(self.vehicle.at_middle(pose)[:2] - slot[:2]).max() > AREA:
             raise InputError(f"start {pose.tolist()} is more than {AREA:g} m away from the slot")
         touched = ObstacleKind(space.touched(*pose.tolist()))
@@ -338,16 +313,44 @@ class ParkingTasks:
 
 
 def require_room(vehicle: VehicleParameters, size: tuple[float, float], what: str) -> None:
-    """Check that a car fits into a slot."""
     for name, own, needed in (("long", size[0], vehicle.length), ("wide", size[1], vehicle.width)):
         if not (math.isfinite(own) and own >= needed):
             raise InputError(f"{what} is {own:g} m {name}, want at least {needed:g} m, the size of the car")
 
 
 def _tangent(line: shapely.LineString, station: float) -> FloatArray:
-    """Unit tangent, (2,), of a line at a station, m."""
     step = 0.05
     low = min(max(station - step, 0.0), line.length - 2 * step)
     ends = [shapely.get_coordinates(line.interpolate(s))[0] for s in (low, low + 2 * step)]
     along = ends[1] - ends[0]
     return np.asarray(along / np.hypot(*along))
+
+
+@dataclass
+class DriveState:
+    """Everything that changes during an episode of `parkenv/Drive-v1`."""
+
+    key: np.uint64
+    task: ParkingTask  # the parking task; never changes
+    vehicle: FloatArray  # (6,) state of the car, see `parkenv.driving.vehicle`
+    rng: np.random.Generator  # random generator of the laser's noise
+    time: float = 0.0  # time since the start, s
+    driven_m: float = 0.0  # distance driven, m
+    direction: int = 0  # direction of the last motion: 1 forward, -1 backward, 0 before the first
+    direction_changes: int = 0  # number of changes between forward and backward
+    contact: str = ""  # name of the obstacle touched, empty without one
+    parked: bool = False  # whether the car has parked
+    over: bool = False  # whether the episode has ended
+    clocks: FloatArray = field(default_factory=lambda: np.empty(0))  # (n,) s, time of each moving road user
+    # (n, 3) x, y in m and yaw in rad, poses of the moving road users
+    movers: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    # x, y in m and yaw in rad of the rear axle after each step
+    trail: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> DriveState:
+        twin = copy.copy(self)  # a task never changes
+        twin.vehicle = self.vehicle.copy()
+        twin.rng = copy.deepcopy(self.rng, memo)
+        twin.trail = list(self.trail)
+        twin.clocks, twin.movers = self.clocks.copy(), self.movers.copy()
+        return twin

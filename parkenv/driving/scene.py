@@ -15,14 +15,12 @@ from shapely.geometry.base import BaseGeometry
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import ObstacleKind, Obstacles
-from parkenv.driving.crossings import Crossing
-from parkenv.driving.vehicle import VehicleParameters
+from parkenv.driving.road_users import Crossing
+from parkenv.driving.vehicle import VehicleParameters, finite_pose
 from parkenv.errors import InputError
 
-MAX_POINTS = 20_000
-"""Greatest number of points of all obstacles of a scene."""
-CHECK_M = 0.02
-"""Greatest distance that any point of the car moves between two checked footprints, m."""
+MAX_POINTS = 20_000  # greatest number of points of all obstacles of a scene
+CHECK_M = 0.02  # greatest distance that any point of the car moves between two checked footprints, m
 POSITION_TOLERANCE_M, ANGLE_TOLERANCE_RAD = 0.05, 0.01
 """How exactly a manoeuvre has to end: ParkBench's tolerances."""
 _TOUCHING = 1e-9  # m², overlap of a footprint and a polygon from which on they are in contact
@@ -40,52 +38,38 @@ class Scene:
     """A parking manoeuvre: where a car starts, where it has to stand, and what it must not touch.
 
     Coordinates are relative to `origin`, so that scenes far from zero lose no digits.
-
-    Args:
-        name: name of the scene.
-        vehicle: the car.
-        start: (3,) x, y in m and yaw in rad of the middle of the rear axle.
-        target: (3,) likewise.
-        contours: the obstacles; polygons need not be convex.
-        bounds: least x and y and greatest x and y, m, that the footprint may reach; None for no limits.
-        origin: (2,) m, of the scene's coordinates in those of its file.
-        crossings: road users that cross it.
     """
 
     name: str
     vehicle: VehicleParameters
-    start: FloatArray
-    target: FloatArray
-    contours: tuple[Contour, ...]
+    start: FloatArray  # (3,) x, y in m and yaw in rad of the middle of the rear axle
+    target: FloatArray  # (3,) likewise
+    contours: tuple[Contour, ...]  # the obstacles; polygons need not be convex
+    # least x and y and greatest x and y, m, that the footprint may reach; None for no limits
     bounds: tuple[float, float, float, float] | None = None
-    origin: FloatArray = field(default_factory=lambda: np.zeros(2))
-    crossings: tuple[Crossing, ...] = ()
+    origin: FloatArray = field(
+        default_factory=lambda: np.zeros(2)
+    )  # m, of the coordinates in those of the file
+    crossings: tuple[Crossing, ...] = ()  # road users that cross it
 
     def __post_init__(self) -> None:
         for name in ("start", "target"):
-            pose = np.array(getattr(self, name), dtype=np.float64)
-            if pose.shape != (3,) or not np.isfinite(pose).all():
-                raise InputError(
-                    f"{name} is {pose.tolist()}, want three finite numbers: x, y in m, yaw in rad"
-                )
-            pose.flags.writeable = False
-            object.__setattr__(self, name, pose)
+            object.__setattr__(self, name, finite_pose(name, getattr(self, name)))
         count = sum(len(contour.points) for contour in self.contours)
         if count > MAX_POINTS:
             raise InputError(f"obstacles have {count:,} points, want at most {MAX_POINTS:,}")
         for i, (points, closed) in enumerate(self.contours):
-            if points.ndim != 2 or points.shape[1] != 2 or len(points) < (3 if closed else 1):
+            if (
+                points.shape[1:] != (2,)
+                or len(points) < (3 if closed else 1)
+                or not np.isfinite(points).all()
+            ):
                 raise InputError(
-                    f"obstacle {i} has the shape {points.shape}, want x and y of 3 corners or more"
+                    f"obstacle {i} has the shape {points.shape}, want finite x and y of 3 corners or more"
                 )
-            if not np.isfinite(points).all():
-                raise InputError(f"obstacle {i} has a coordinate that is not finite, want numbers")
         for i, shape in enumerate(self.shapes):
             if not shape.is_valid:
-                reason = shapely.is_valid_reason(shape)
-                raise InputError(
-                    f"obstacle {i} is not a simple polygon ({reason}), want edges that do not cross"
-                )
+                raise InputError(f"obstacle {i} is no simple polygon: {shapely.is_valid_reason(shape)}")
         for name in ("start", "target"):
             if self.check(getattr(self, name)[None]).contact:
                 raise InputError(
@@ -95,14 +79,14 @@ class Scene:
     @cached_property
     def shapes(self) -> list[BaseGeometry]:
         """The obstacles as polygons, lines and points."""
-        made: list[BaseGeometry] = []
+        shapes: list[BaseGeometry] = []
         for points, closed in self.contours:
             alone = len(points) == 1 or (not closed and (points == points[0]).all())
             kind = shapely.Polygon if closed else shapely.LineString
-            made.append(shapely.Point(points[0]) if alone else kind(points))
+            shapes.append(shapely.Point(points[0]) if alone else kind(points))
         if self.bounds is not None:
-            made.append(shapely.box(*self.bounds).exterior)
-        return made
+            shapes.append(shapely.box(*self.bounds).exterior)
+        return shapes
 
     @cached_property
     def obstacles(self) -> Obstacles:
@@ -132,8 +116,8 @@ class Scene:
         overlap = shapely.area(shapely.intersection(cars[car[solid]], shapes[near[solid]])) > _TOUCHING
         if not solid.all() or overlap.any():
             return FootprintCheck(True, 0.0)
-        found, away = tree.query_nearest(cars, return_distance=True)
-        return FootprintCheck(False, float(away.min()) if found.size else math.inf)
+        away = tree.query_nearest(cars, return_distance=True)[1]
+        return FootprintCheck(False, float(away.min()) if away.size else math.inf)
 
     def error(self, pose: FloatArray) -> tuple[float, float]:
         """Return distance, m, and angle, rad, of a pose of the rear axle from the target."""
@@ -176,17 +160,16 @@ def _between(poses: FloatArray, vehicle: VehicleParameters) -> FloatArray:
 def outlines_without(
     lines: Sequence[FloatArray], pose: FloatArray, vehicle: VehicleParameters, step: float
 ) -> list[Contour]:
-    """Leave out what of obstacle lines lies in the footprint at a pose, as ParkBench does with points.
+    """Leave out what of obstacle lines lies in the footprint at a pose, as ParkBench does with points every `step` m.
 
-    A line has a point every `step` m at most. Points in the footprint are left out, and so are the pieces beside them;
-    what is left of a line stays in one piece, and single points stay points.
+    Pieces beside points in the footprint go, too; what is left of a line stays in one piece, single points stay points.
     """
     car = shapely.Polygon(vehicle.corners(pose))
     shapely.prepare(car)
-    kept: list[Contour] = []
+    outside: list[Contour] = []
     for line in lines:
         if car.distance(shapely.LineString(line) if len(line) > 1 else shapely.Point(line[0])) > step:
-            kept.append(Contour(line, closed=False))
+            outside.append(Contour(line, closed=False))
             continue
         parts = [line[:1]]
         for start, end in pairwise(line):
@@ -198,5 +181,5 @@ def outlines_without(
         edges = np.asarray(shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1)))
         whole &= ~shapely.intersects(car, edges)
         parts = np.split(np.arange(len(points)), np.flatnonzero(~whole) + 1)
-        kept += [Contour(points[part], closed=False) for part in parts if not inside[part].any()]
-    return kept
+        outside += [Contour(points[part], closed=False) for part in parts if not inside[part].any()]
+    return outside

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, Strict
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.driving.crossings import Crossing
+from parkenv.driving.road_users import Crossing
 from parkenv.driving.scene import MAX_POINTS, Contour, Scene, outlines_without
 from parkenv.driving.vehicle import TPCAP, VEHICLES, VehicleParameters
 from parkenv.errors import InputError, naming, nearest
@@ -24,8 +24,7 @@ from parkenv.files.spec_file import Several, Spec, read_tables
 
 SCENE_SUFFIXES = (".csv", ".json", ".toml", ".geojson")
 """Suffixes of the files that are read in a folder of scenes."""
-PARKBENCH_STEP_M = 0.1
-"""Distance of the points into which ParkBench divides its lines."""
+PARKBENCH_STEP_M = 0.1  # distance of the points into which ParkBench divides its lines
 
 
 def vehicle_of(given: object, folder: str | Path = ".") -> VehicleParameters:
@@ -104,18 +103,8 @@ def scene_files(path: str | Path) -> list[Path]:
     return files
 
 
-def read_scenes(path: str | Path, vehicle: VehicleParameters | None = None) -> list[Scene]:
-    """Read all scenes of a file or folder; see `scene_files` and `read_scene`."""
-    return [read_scene(file, vehicle) for file in scene_files(path)]
-
-
 def read_scene(path: str | Path, vehicle: VehicleParameters | None = None) -> Scene:
-    """Read the scene of a file.
-
-    Args:
-        path: the file.
-        vehicle: the car; None for the one of the file, or else the one that goes with its format.
-    """
+    """Read the scene of a file; without a vehicle, the car is that of the file or of its format."""
     path = Path(path)
     with naming(path):
         if path.suffix.lower() == ".toml":
@@ -129,7 +118,7 @@ def read_scene(path: str | Path, vehicle: VehicleParameters | None = None) -> Sc
         return _own(_of_geojson(content) if "features" in content else content, path, vehicle)
 
 
-def _made(
+def _scene(
     name: str,
     vehicle: VehicleParameters,
     start: Sequence[float],
@@ -158,20 +147,16 @@ def _tpcap(text: str, name: str, vehicle: VehicleParameters | None) -> Scene:
         ) from None
     if not np.isfinite(values).all():
         raise InputError(f"number {int(np.argmin(np.isfinite(values))) + 1} is not finite")
-    n = int(values[6]) if len(values) > 6 and 0 <= values[6] < len(values) else -1
-    counts = values[7 : 7 + n].astype(np.int64) if n >= 0 else np.array([-1])
-    if (
-        len(counts) != max(n, 1 if n < 0 else 0)
-        or (counts < 0).any()
-        or 7 + n + 2 * counts.sum() != len(values)
-    ):
+    n = int(values[6]) if len(values) > 6 and 0 <= values[6] <= len(values) - 7 else -1
+    counts = values[7 : 7 + max(n, 0)].astype(np.int64)
+    if n < 0 or (counts < 0).any() or 7 + n + 2 * counts.sum() != len(values):
         raise InputError(
             f"has {len(values)} numbers, want start and target (x, y, yaw), the number of obstacles, the corners "
             "of each, and x and y of every corner"
         )
     corners = np.split(values[7 + n :].reshape(-1, 2), np.cumsum(counts)[:-1]) if n else []
     contours = [Contour(_opened(points)) for points in corners]
-    return _made(name, vehicle or TPCAP, values[:3].tolist(), values[3:6].tolist(), contours)
+    return _scene(name, vehicle or TPCAP, values[:3].tolist(), values[3:6].tolist(), contours)
 
 
 def _parkbench(content: Mapping[str, Any], name: str, vehicle: VehicleParameters | None) -> Scene:
@@ -191,18 +176,16 @@ def _parkbench(content: Mapping[str, Any], name: str, vehicle: VehicleParameters
         if sum(map(len, nodes)) > MAX_POINTS:
             raise InputError(f"has {sum(map(len, nodes)):,} points of obstacles, want at most {MAX_POINTS:,}")
         lines = [
-            np.array([(n["m_x"], n["m_y"]) for n in each], dtype=np.float64)
-            for each in nodes
-            if len(each) > 1
+            np.array([(n["m_x"], n["m_y"]) for n in each], np.float64) for each in nodes if len(each) > 1
         ]
+    except InputError:
+        raise
     except (AttributeError, IndexError, KeyError, StopIteration, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"is no scene of ParkBench: {type(error).__name__} {error}") from error
     car = vehicle or TPCAP  # the file names no car
     # The benchmark drops obstacle points in the footprint of the parked car, such as wheel stops.
     contours = outlines_without(lines, goal, car, PARKBENCH_STEP_M)
-    return _made(name, car, start.tolist(), goal.tolist(), contours)
+    return _scene(name, car, start.tolist(), goal.tolist(), contours)
 
 
 def _own(content: Mapping[str, Any], path: Path, vehicle: VehicleParameters | None) -> Scene:
@@ -214,12 +197,12 @@ def _own(content: Mapping[str, Any], path: Path, vehicle: VehicleParameters | No
         points = np.array(each.polygon or each.line)
         contours.append(Contour(_opened(points)) if each.polygon else Contour(points, closed=False))
     given = VehicleParameters() if spec.vehicle is None else vehicle_of(spec.vehicle, path.parent)
-    made = _made(path.stem, vehicle or given, spec.start, spec.target, contours, spec.bounds)
+    scene = _scene(path.stem, vehicle or given, spec.start, spec.target, contours, spec.bounds)
     crossings = []
     for user in spec.crossings:
-        start, end = (tuple((np.array(point) - made.origin).tolist()) for point in user.way)
+        start, end = (tuple((np.array(point) - scene.origin).tolist()) for point in user.way)
         crossings.append(Crossing(user.kind, (start, end), user.speed_mps, user.begins_s))
-    return dataclasses.replace(made, crossings=tuple(crossings))
+    return dataclasses.replace(scene, crossings=tuple(crossings))
 
 
 def _of_geojson(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -247,9 +230,9 @@ def _of_geojson(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def _opened(points: FloatArray) -> FloatArray:
     """Drop the last corner of a closed polygon, and corners that repeat the one before."""
-    kept = np.ones(len(points), dtype=np.bool_)
-    kept[1:] = (np.diff(points, axis=0) != 0.0).any(axis=1)
-    points = points[kept]
+    fresh = np.ones(len(points), dtype=np.bool_)
+    fresh[1:] = (np.diff(points, axis=0) != 0.0).any(axis=1)
+    points = points[fresh]
     return points[:-1] if len(points) > 3 and (points[0] == points[-1]).all() else points
 
 

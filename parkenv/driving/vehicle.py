@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import InputError, naming
+from parkenv.files.field_types import Positive, Validated
 
 PHYSICS_S = 0.05  # physics time step, s
 X, Y, YAW, SPEED, STEERING, ACCELERATION = range(6)
@@ -22,7 +23,7 @@ STRAIGHT = 1e-6  # turn per step, rad, below which an arc is approximated by its
 
 
 @dataclass(frozen=True)
-class VehicleParameters:
+class VehicleParameters(Validated):
     """Dimensions and limits of a car; by default a 2012 Volkswagen Golf with a kerb-to-kerb turning circle of 10.9 m.
 
     Args:
@@ -45,38 +46,33 @@ class VehicleParameters:
         4.0
     """
 
-    length: float = 4.26
-    width: float = 1.80
-    wheelbase: float = 2.64
-    rear_overhang: float = 0.78
-    max_steering: float = 0.583
-    steering_rate: float = 0.6
-    max_speed: float = 8.0
-    max_reverse_speed: float = 3.0
-    max_acceleration: float = 2.0
-    max_braking: float = 6.0
-    acceleration_rate: float = 15.0
+    length: Positive = 4.26
+    width: Positive = 1.80
+    wheelbase: Positive = 2.64
+    rear_overhang: Positive = 0.78
+    max_steering: Positive = 0.583
+    steering_rate: Positive = 0.6
+    max_speed: Positive = 8.0
+    max_reverse_speed: Positive = 3.0
+    max_acceleration: Positive = 2.0
+    max_braking: Positive = 6.0
+    acceleration_rate: Positive = 15.0
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if not (number and math.isfinite(value) and value > 0.0):
-                raise InputError(f"vehicle {field.name} is {value!r}, want a finite number above 0")
+        with naming("vehicle"):
+            super().__post_init__()
         if self.rear_overhang + self.wheelbase > self.length:
             raise InputError(
-                f"vehicle wheelbase {self.wheelbase:g} m and rear_overhang {self.rear_overhang:g} m: want both within "
-                f"the length, {self.length:g} m"
+                f"vehicle wheelbase and rear_overhang: want both within the length, {self.length:g} m"
             )
         if self.max_steering >= math.pi / 2:
             raise InputError(f"vehicle max_steering is {self.max_steering:g} rad, want below a right angle")
         fastest = 0.5 * self.length / PHYSICS_S
-        for name in ("max_speed", "max_reverse_speed"):
-            if getattr(self, name) > fastest:
-                raise InputError(
-                    f"vehicle {name} is {getattr(self, name):g} m/s, want at most {fastest:g}: half a length in a step "
-                    "of the physics, or the car could pass through things"
-                )
+        if max(self.max_speed, self.max_reverse_speed) > fastest:
+            # Faster, it could pass through things.
+            raise InputError(
+                f"vehicle speeds: want at most {fastest:g} m/s, half a length in a step of the physics"
+            )
 
     @cached_property
     def turning_radius(self) -> float:
@@ -142,6 +138,18 @@ VEHICLES = {
 paper on ParkBench (2026, appendix B), without its cut corners and with the speeds and rates of the second."""
 
 
+def finite_pose(name: str, given: object) -> FloatArray:
+    """Return x, y in m and yaw in rad, (3,), read-only; `name` is for the message."""
+    try:
+        pose = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise InputError(f"{name} is {given!r:.60}, want three finite numbers: x, y in m and yaw in rad")
+    pose.flags.writeable = False
+    return pose
+
+
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
     """Transform points of one body, (k, 2) m, or of each, (..., k, 2) m, to poses, (..., 3); returns (..., k, 2) m."""
     pose = np.asarray(pose, dtype=np.float64)
@@ -175,14 +183,8 @@ def advance(state: FloatArray, acceleration: float, steering: float, limits: Flo
     Steering angle and acceleration approach the command as fast as their rates allow, and are then constant for the
     step, so that the motion is an exact arc. A braking car comes to rest and stays at rest for the rest of the step.
 
-    Args:
-        state: (6,) float64, changed in place; columns: see `X`.
-        acceleration: fraction of the limit, -1 to 1; of the braking limit against the direction of motion.
-        steering: fraction of the largest angle, -1 to 1, positive to the left.
-        limits: `VehicleParameters.limits`.
-
-    Returns:
-        The distance driven, m, negative backward.
+    `state`, (6,) with the columns of `X`, changes in place. Commands are fractions, -1 to 1, of the limits: of braking
+    against the direction of motion; of steering, positive to the left. Return the way, m, negative backward.
     """
     wheelbase, max_steering, steering_rate, max_speed, max_reverse, max_faster, max_slower, rate = limits
     dt = PHYSICS_S

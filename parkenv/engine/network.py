@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -40,7 +40,7 @@ from parkenv.engine.policy import (
     search_of,
 )
 from parkenv.engine.records import N_ACTIONS, N_REGIONS
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_one_of
 from parkenv.world.occupancy.kernel import inlined, kernel
 from parkenv.world.scenario import SearchProblem
 
@@ -85,7 +85,6 @@ surroundings_at, network_at = record_at(SURROUNDINGS), record_at(NETWORK)
 
 @kernel
 def decide_by_network(address: int, number: int) -> int:
-    """Choose the action of the network of the car's kind."""
     car = car_of(address, number)
     search, network = search_of(car.search), network_at(policy_data(address, car), 0)
     around = _surroundings_of(network)
@@ -116,7 +115,7 @@ def _surroundings_of(network: Any) -> Surroundings:
 
 @inlined
 def _logits(network: Any, search: Any) -> int:
-    """Compute the network's output for the observation in `local`; returns the address of (5,) float32."""
+    """Return the address of the network's output, (5,) float32, for the observation in `local`."""
     widths = int64s(network.widths)
     local, values = float32s(network.local), float32s(network.values)
     # The inputs are in alphabetical order: `action_mask`, then `local`.
@@ -178,8 +177,16 @@ def _choose(network: Any, search: Any, logits_at: int) -> int:
     return best
 
 
-class NetworkPolicy(CompiledPolicy):
-    """A policy network, a multilayer perceptron on the `local` observation, as a compiled policy of a fleet.
+def compiled_network(
+    layers: Sequence[Layer],
+    k: int = 5,
+    *,
+    activation: str = "tanh",
+    masked: bool = True,
+    sampled: bool = False,
+    name: str = "network",
+) -> CompiledPolicy:
+    """Make a policy network, a multilayer perceptron on the `local` observation, a compiled policy of a fleet.
 
     Args:
         layers: weights and biases from the inputs, `action_mask` and `local`, to logits, or values, of the actions.
@@ -189,58 +196,34 @@ class NetworkPolicy(CompiledPolicy):
         sampled: whether to draw actions from the policy, instead of taking the most probable one.
         name: for tables.
     """
+    require_one_of("activation", activation, ACTIVATIONS)
+    shapes = [weights.shape for weights, _ in layers]
+    widths = [shapes[0][1], *(shape[0] for shape in shapes)] if shapes else [0]
+    wanted = N_ACTIONS + FIRST_NEAR + PER_NEAR * k
+    if (widths[0], widths[-1]) != (wanted, N_ACTIONS) or shapes != [(b, a) for a, b in pairwise(widths)]:
+        raise InputError(f"layers have shapes {shapes}, want a chain from {wanted} numbers to {N_ACTIONS}")
+    flat = [part for weights, biases in layers for part in (weights.T.ravel(), biases)]
+    arrays: dict[str, NDArray[Any]] = {
+        "widths": np.array(widths, np.int64),
+        "weights": np.concatenate(flat).astype(np.float32),
+        "values": np.zeros(2 * max(widths), np.float32),
+    }
+    numbers = {
+        "n_layers": len(layers), "widest": max(widths), "activation": ACTIVATIONS.index(activation),
+        "masked": masked, "sampled": sampled,
+    }  # fmt: skip
+    return CompiledPolicy(name, decide_by_network, partial(_tables, k, numbers, arrays))
 
-    def __init__(
-        self,
-        layers: Sequence[Layer],
-        k: int = 5,
-        *,
-        activation: str = "tanh",
-        masked: bool = True,
-        sampled: bool = False,
-        name: str = "network",
-    ) -> None:
-        super().__init__(name, decide_by_network)
-        self.k = k
-        if activation not in ACTIVATIONS:
-            raise InputError(f"activation is {activation!r}, want one of {', '.join(ACTIVATIONS)}")
-        shapes = [weights.shape for weights, _ in layers]
-        widths = [shapes[0][1], *(shape[0] for shape in shapes)] if shapes else [0]
-        wanted = N_ACTIONS + FIRST_NEAR + PER_NEAR * self.k
-        chain = [(b, a) for a, b in pairwise(widths)]
-        if (widths[0], widths[-1]) != (wanted, N_ACTIONS) or shapes != chain:
-            raise InputError(
-                f"layers have shapes {shapes}, want a chain from {wanted} numbers to {N_ACTIONS}"
-            )
-        flat = [part for weights, biases in layers for part in (weights.T.ravel(), biases)]
-        self._arrays: dict[str, NDArray[Any]] = {
-            "widths": np.array(widths, np.int64),
-            "weights": np.concatenate(flat).astype(np.float32),
-            "values": np.zeros(2 * max(widths), np.float32),
-        }
-        self._numbers = {
-            "n_layers": len(layers), "widest": max(widths), "activation": ACTIVATIONS.index(activation),
-            "masked": masked, "sampled": sampled,
-        }  # fmt: skip
-        self._arguments = partial(
-            type(self), layers, k, activation=activation, masked=masked, sampled=sampled
-        )
 
-    def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
-        around = Surroundings.of(problems, self.k)
-        arrays = {name: np.ascontiguousarray(array) for name, array in around._asdict().items()}
-        numbers = {
-            "n_lots": len(around.first),
-            "n_vertices": len(around.numbers),
-            "n_numbers": around.numbers.shape[1],
-            "n_indices": around.indices.shape[1],
-            "k": self.k,
-        }
-        tables = PolicyData(SURROUNDINGS, numbers, arrays)
-        local = np.zeros(FIRST_NEAR + PER_NEAR * self.k, np.float32)
-        arrays = {**self._arrays, "surroundings": tables.record, "local": local}
-        return PolicyData(NETWORK, self._numbers, arrays, tables)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the network; records hold addresses of this process."""
-        return partial(self._arguments, name=self.name), ()
+def _tables(
+    k: int, numbers: Mapping[str, int], arrays: Mapping[str, NDArray[Any]], problems: Sequence[SearchProblem]
+) -> PolicyData:
+    around = Surroundings.of(problems, k)
+    lengths = {
+        "n_lots": len(around.first), "n_vertices": len(around.numbers), "n_numbers": around.numbers.shape[1],
+        "n_indices": around.indices.shape[1], "k": k,
+    }  # fmt: skip
+    contiguous = {name: np.ascontiguousarray(array) for name, array in around._asdict().items()}
+    tables = PolicyData(SURROUNDINGS, lengths, contiguous)
+    local = np.zeros(FIRST_NEAR + PER_NEAR * k, np.float32)
+    return PolicyData(NETWORK, numbers, {**arrays, "surroundings": tables.record, "local": local}, tables)

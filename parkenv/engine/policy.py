@@ -42,8 +42,7 @@ from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import inlined
 from parkenv.world.scenario import SearchProblem
 
-LEAVE = -1
-"""Action of compiled policies: give up and park elsewhere."""
+LEAVE = -1  # action of compiled policies: give up and park elsewhere
 TAKE_SLOT = 16
 """Action of compiled policies: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
 
@@ -79,10 +78,13 @@ class CompiledPolicy:
     Args:
         name: for tables.
         decide: compiled function (int64 address of the FLEET record, int64 index of the car) -> int64 action.
+        tables: makes what the policy needs in a fleet, which keeps it, from the problem of each scenario, by
+            `scenario_index` of the CAR record; a function that can be pickled. None: nothing.
     """
 
     name: str
     decide: Callable[[int, int], int]
+    tables: Callable[[Sequence[SearchProblem]], PolicyData] | None = None
 
     @cached_property
     def address(self) -> int:
@@ -90,35 +92,23 @@ class CompiledPolicy:
         return call_address(self.decide)
 
     def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData | None:
-        """Return what the policy needs in a fleet, which keeps it; None by default.
-
-        Args:
-            problems: problem of each place, by `place` of the CAR record.
-        """
-        del problems
-        return None
+        """Return the `tables` for some problems."""
+        return None if self.tables is None else self.tables(problems)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the policy without its address in this process."""
-        return type(self), (self.name, self.decide)
+        return type(self), (self.name, self.decide, self.tables)
 
 
 @inlined
 def car_of(address: int, number: int) -> Any:
-    """Return the CAR record of a car that decides.
-
-    A policy reads `place` and `search`, and may change `target` and `n_moves`, its memory of the search: -1 and 0 at
-    first.
-    """
+    """Return a CAR record; a policy may change `target` and `n_moves`, its memory of the search: -1 and 0 at first."""
     return car_at(fleet_at(address, 0).cars, number)
 
 
 @inlined
 def search_of(address: int) -> Any:
-    """Return the SEARCH record at an address, `search` of a CAR record, of which a policy reads `vertex`.
-
-    It may change the array at `moves`, (2 n_vertices,) uint8, which holds anything at first.
-    """
+    """Return a SEARCH record; a policy may change the array at `moves`, (2 n_vertices,) uint8, anything at first."""
     return search_at(address, 0)
 
 

@@ -21,8 +21,7 @@ from parkenv.world.week import DAY_S
 LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
 OBSERVATIONS = ("full", "occupancy", "local")
 """What a search may observe; see `parkenv.envs.search.SearchEnv`."""
-BELIEF_PARTS = ("belief", "step_observed")
-"""What `occupancy` leaves out of `full`."""
+BELIEF_PARTS = ("belief", "step_observed")  # what `occupancy` leaves out of `full`
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
 _FLAT = ("p_occupied", "day_error", "action_mask")
 

@@ -16,11 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
-from parkenv.driving.drive_state import DriveState
-from parkenv.driving.parking_task import AREA, KINDS, ParkingTask, ParkingTasks
+from parkenv.driving.parking_task import AREA, KINDS, DriveState, ParkingTask, ParkingTasks
+from parkenv.driving.road_users import YieldingTraffic
 from parkenv.driving.scene_files import vehicle_of
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
-from parkenv.driving.yielding_traffic import YieldingTraffic
 from parkenv.envs.drive_observation import (
     CORNERS,
     FAR,

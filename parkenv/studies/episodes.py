@@ -46,7 +46,7 @@ class SearchRecorder(Observer):
         if self._steps:
             action = int(step.action)
             preview = self._preview_of and self._preview_of(step.observation, action, step.memory)
-            self._record(action=action, plan=tuple(preview.path) if preview else (), info=step.info)
+            self._record(action=action, plan=preview or (), info=step.info)
 
     def _record(self, **decision: Any) -> None:
         if self._steps:

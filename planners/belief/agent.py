@@ -17,13 +17,7 @@ from parkenv.errors import require_number
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import nearness
 from parkenv.world.scenario import SearchProblem
-from planners.agent import (
-    Observation,
-    PlanPreview,
-    SearchAgent,
-    belief_for_decision,
-    require_observations,
-)
+from planners.agent import Observation, SearchAgent, belief_for_decision, require_observations
 from planners.belief.best_path import ATTEMPT, NOWHERE, best_path
 from planners.belief.path import Budget, Course
 from planners.belief.planning_graph import (
@@ -61,7 +55,6 @@ class Crowd(NamedTuple):
     met: int = 0  # number of times that one has come into view
 
     def after(self, observation: Observation) -> Crowd:
-        """Return what it has seen after one more observation."""
         if "cars" not in observation:
             return self
         in_view = int(observation["cars"][0].sum())
@@ -98,13 +91,6 @@ class BeliefSearch:
         other.day, other.state, other.past = self.day.copy(), self.state.copy(), self.past.copy()
         other.missed_rate = self.missed_rate.copy()
         return other
-
-    def leave_path(self) -> None:
-        """Give up the path of the last decision: the car has taken another way."""
-        self.course, self.remaining_s = (
-            self.course._replace(targets=self.course.targets[:0], heading=-1),
-            math.inf,
-        )
 
 
 class BeliefAgent(SearchAgent[BeliefSearch]):
@@ -156,6 +142,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     """
 
     name: ClassVar[str] = "belief"
+    memory: ClassVar = BeliefSearch
 
     def __init__(
         self,
@@ -198,7 +185,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 
     def _search_of(self, near: Neighborhood, belief: SlotBelief, crowd: Crowd) -> BeliefSearch:
         n = near.n_slots
-        return BeliefSearch(
+        search: BeliefSearch = self.memory(
             near=near,
             n_unobserved=n,
             crowd=crowd,
@@ -210,9 +197,9 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             paths=path_buffers(len(FAILURE_COSTS) + 1, n, len(near.vertices)),
             past=[],
         )
+        return search
 
     def _day_belief(self, near: Neighborhood, belief: SlotBelief, crowd: Crowd) -> DayBelief:
-        """Return the belief about the day and the slots of a part before its observations, at an arrival."""
         slots, rival_rates = near.slots, self._rival_rates(belief, crowd)
         return DayBelief(
             belief.take(slots),
@@ -225,15 +212,12 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 
     def _rival_rates(self, belief: SlotBelief, crowd: Crowd) -> FloatArray | None:
         """Return the rates at which rivals take each slot, (n_slots,) 1/s; None without rivals."""
-        del belief, crowd
         return None
 
     def _planning_graph(self, memory: BeliefSearch) -> PlanningGraph:
-        """Return the lot, or the part of it that is planned for, as the path search uses it."""
         return memory.near.planning_graph(self.problem, self.failure_s)
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
-        """Update the memory, search for the best path, and take its first step or park."""
         vertex = int(observation["vertex"])
         if not memory.near.whole:
             memory.past.append(belief.observations)
@@ -257,7 +241,6 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return self.wait(vertex) if action is None else action
 
     def _update(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
-        """Update the memory from the observation; return the belief about the slots of its part."""
         near = memory.near
         known = belief.take(near.slots)
         state = known.state
@@ -310,7 +293,6 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return near.table.move_to(here, following)
 
     def _change_part(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
-        """Change the planned part of the lot to the one around the car; keep what is known about it."""
         old = memory.near
         near = self._neighborhoods.around(vertex, np.flatnonzero(belief.observed_taken))
         new = self._search_of(near, belief, memory.crowd)
@@ -329,7 +311,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         memory.n_unobserved = int(np.count_nonzero(memory.state == UNOBSERVED))
         return known
 
-    def plan_preview(self, observation: Observation, action: int, memory: BeliefSearch) -> PlanPreview:
+    def plan_preview(self, observation: Observation, action: int, memory: BeliefSearch) -> tuple[int, ...]:
         """Return the path that the agent would drive if it observed only taken slots."""
         belief = belief_for_decision(observation)
         imagined = memory.copy()
@@ -345,11 +327,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             shown = problem.in_view(vertex)
             belief = belief.update(shown, ~belief.observed_free[shown])
             action = self.decide({"vertex": vertex}, belief, imagined)
-        return PlanPreview(tuple(path))
+        return tuple(path)
 
 
 def snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapshot:
-    """Return the belief about the slots of a part as the path search uses it."""
     weights, p_free_if = memory.day.mixture()
     slots = np.empty(len(memory.state), SLOT)
     slots["missed_rate"], slots["state"] = memory.missed_rate, memory.state

@@ -24,14 +24,7 @@ from planners.belief.path import (
     options_at_hand,
     rollout_path,
 )
-from planners.belief.planning_graph import (
-    BeliefSnapshot,
-    PathBuffer,
-    PlanningGraph,
-    Records,
-    is_hidden,
-    leaf,
-)
+from planners.belief.planning_graph import BeliefSnapshot, PathBuffer, PlanningGraph, Records, is_hidden, leaf
 
 MOST_OPTIONS = 12  # maximum number of slots known to be free that are considered, best first
 NOWHERE, ATTEMPT = -1, -2
@@ -73,29 +66,24 @@ def best_path(
 ) -> PathChoice:
     """Search for the path with the least expected time, starting from the path of the last decision.
 
-    `course` is that of the last decision, without `heading` where its slot was observed since; `remaining_s` the time
-    expected to remain on that path, or inf if something was observed since. The path is kept unless another is better
-    than this: estimates depend on the position of the car, so it could turn round for ever. `paths` are buffers, one
-    more than there are failure costs.
+    It is kept unless another one is better than `remaining_s`, the time expected to remain on it, or inf if something
+    was observed since: estimates depend on the position of the car, so it could turn round for ever. `paths` are
+    buffers, one more than there are failure costs.
     """
     # Nearest vertices first: with a small budget they matter most for the next step.
     order = np.argsort(graph.drive_s[vertex], kind="stable")
-    nothing_known = np.empty(0, np.int64), np.zeros(len(belief.slots))
-    search = Search(vertex, order, graph, belief, *nothing_known, budget)
-    value, at_hand_s, slot, work, course_ahead = _best_path(course, remaining_s, search, paths)
-    return PathChoice(Value(*value), at_hand_s, slot, work, Course(*course_ahead))
+    search = Search(vertex, order, graph, belief, np.empty(0, np.int64), np.zeros(len(belief.slots)), budget)
+    choice: PathChoice = _best_path(course, remaining_s, search, paths)
+    return choice
 
 
 def is_compiled() -> bool:
-    """Return whether this process has the code of `best_path`."""
     return bool(getattr(_best_path, "signatures", True))
 
 
 @compiled(error_model="numpy")
-def _best_path(
-    course: Course, remaining_s: float, search: Search, paths: PathBuffer
-) -> tuple[tuple[float, float, int], float, int, int, tuple[IntArray, int, float]]:
-    """Return the fields of `PathChoice` for a search that has no options yet."""
+def _best_path(course: Course, remaining_s: float, search: Search, paths: PathBuffer) -> PathChoice:
+    """Choose, for a search that has no options yet."""
     vertex, graph, belief, costs = search.vertex, search.graph, search.belief, search.budget.failure_costs
     search_s = _plans(course.failure_s, search, paths)
     c = np.argmin(search_s)
@@ -123,7 +111,7 @@ def _best_path(
         search_s[c] = np.inf
         c = np.argmin(search_s)
     if best.onward_s == np.inf:
-        return (np.inf, np.inf, NOWHERE), at_hand_s, slot, 0, (targets[:0], -1, course.failure_s)
+        return PathChoice(best, at_hand_s, slot, 0, Course(targets[:0], -1, course.failure_s))
 
     work, heading = 0, chosen.stops[1].target
     for _ in range(search.budget.depth - len(course.targets)):
@@ -136,8 +124,7 @@ def _best_path(
         rollout_path(course, search, path)
     if len(course.targets):
         heading = -1
-    value = best.onward_s, best.remaining_s, best.next_vertex
-    return value, at_hand_s, slot, work, (course.targets, heading, course.failure_s)
+    return PathChoice(best, at_hand_s, slot, work, Course(course.targets, heading, course.failure_s))
 
 
 @compiled(error_model="numpy")
@@ -306,14 +293,7 @@ def _on_route(targets: IntArray, search: Search, path: PathBuffer) -> NDArray[np
 
 @compiled(error_model="numpy")
 def _path_at(index: int, paths: PathBuffer) -> PathBuffer:
-    """Return the buffer of one path. Paths share their scratch arrays."""
     return PathBuffer(
-        paths.state[index],
-        paths.stops[index],
-        paths.observations[index],
-        paths.marks,
-        paths.weights,
-        paths.remembered,
-        paths.kept_s,
-        paths.value_s,
-    )
+        paths.state[index], paths.stops[index], paths.observations[index], paths.marks, paths.weights,
+        paths.remembered, paths.kept_s, paths.value_s,
+    )  # fmt: skip

@@ -111,13 +111,8 @@ def _start(heading: int, search: Search, path: PathBuffer) -> None:
         n_unproven += observed != OBSERVED_TAKEN
     state.n_unproven, state.n_unobserved = n_unproven, n_unobserved
     stops[0].vertex, stops[0].time, stops[0].first, stops[1].first = search.vertex, 0.0, 0, 0
-    state.vertex, state.time, state.n_stops, state.n_observations, state.n_passed = (
-        search.vertex,
-        0.0,
-        1,
-        0,
-        0,
-    )
+    state.vertex, state.time = search.vertex, 0.0
+    state.n_stops, state.n_observations, state.n_passed = 1, 0, 0
     state.target, state.chooses = heading, heading < 0
     reset_weights(belief, path)
 
@@ -203,13 +198,8 @@ def _drive(search: Search, path: PathBuffer) -> None:
 def _observe_here(search: Search, path: PathBuffer) -> None:
     """Add the observations from the last stop, and the result of an attempt if they do not show the target."""
     state, graph, belief = path.state[0], search.graph, search.belief
-    vertex, time, target, n_observations, n_first = (
-        state.vertex,
-        state.time,
-        state.target,
-        state.n_observations,
-        0,
-    )
+    vertex, time, target = state.vertex, state.time, state.target
+    n_observations, n_first = state.n_observations, 0
     weights = path.weights[: len(belief.weights)]
     n_views = graph.view_starts[vertex + 1] - graph.view_starts[vertex]
     for i in range(n_views + 1):
@@ -237,12 +227,8 @@ def _observe_here(search: Search, path: PathBuffer) -> None:
             if p_free == 0.0 and not attempts:
                 continue
         observation = path.observations[n_observations]
-        observation.slot, observation.p_free, observation.time, observation.is_first = (
-            s,
-            p_free,
-            time,
-            is_first,
-        )
+        observation.slot, observation.p_free = s, p_free
+        observation.time, observation.is_first = time, is_first
         path.marks[s].observed_at = time
         n_observations += 1
         if s == target:
@@ -288,7 +274,6 @@ def is_worth_an_attempt(
 
 @step
 def _is_attempt_due(graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer) -> bool:
-    """Return whether to attempt to park where a path has come to."""
     vertex = path.state[0].vertex
     if vertex >= len(path.marks):
         return False
@@ -329,8 +314,8 @@ def _repeat_part(
 ) -> float:
     """Return the expected time, s, of driving a part of a path repeatedly until a slot on it becomes free.
 
-    All its slots were just observed taken. The probability that an observation finds its slot free follows from the
-    time since the previous observation of that slot, so frequent observations of few slots are not overrated.
+    P(free) at an observation follows from the time since the slot's previous one, so frequent observations of few slots
+    are not overrated.
     """
     stops, observations, marks = path.stops, path.observations, path.marks
     start, end = stops[first].vertex, stops[last].vertex
@@ -343,11 +328,9 @@ def _repeat_part(
     for j in range(stops[first].first, n_observations):
         s = observations[j].slot
         before = marks[s].scratch
-        gap = (
-            observations[j].time - before
-            if before >= 0.0
-            else period - (marks[s].observed_at - observations[j].time)
-        )
+        gap = observations[j].time - before
+        if before < 0.0:
+            gap = period - (marks[s].observed_at - observations[j].time)
         marks[s].scratch = observations[j].time
         at, usual = belief.slots[s], observations[j].value
         p_free = usual * decayed_part(at.decay_rate * at.p_free_usual / usual, gap)
@@ -386,10 +369,7 @@ def p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnaps
 
 @leaf
 def p_free_when_first_observed(weights: FloatArray, p_free_if: FloatArray, taken_follows: bool) -> float:
-    """Return the mean P(free) of a slot at its first observation, given P(free) under each hypothesis, (k,).
-
-    If the path continues only if the slot is taken, the weights of the hypotheses, (k,), are updated in place.
-    """
+    """Return the mean P(free) of a slot; the weights, (k,), change in place if the path goes on only if it is taken."""
     p_free: float = mean_over_days(weights, p_free_if)
     if taken_follows:
         scale = 1.0 / (1.0 - p_free)
@@ -408,9 +388,9 @@ def expected_cost_to_slot(
     graph: PlanningGraph,
     belief: BeliefSnapshot,
 ) -> float:
-    """Return the expected time, s, from a vertex to a slot that was free with `p_free` when observed `age` s ago.
+    """Return the expected time, s, from a vertex to a slot that was free with `p_free` `age` s ago.
 
-    The search goes on for `fallback_s` if the slot is taken.
+    If it is taken, the search goes on for `fallback_s`.
     """
     drive = graph.drive_s[vertex, slot]
     if drive == np.inf:
@@ -451,14 +431,10 @@ def options_at_hand(
 def evaluate_path(search: Search, path: PathBuffer) -> tuple[float, float]:
     """Return the least expected time, s, of following a path with the option to stop at any time.
 
-    What an observation says about the day depends on the decision that follows. If the car would park in the slot were
-    it free, then going on means that it was taken. If the car drives past in either case, the observation is no
-    evidence on average. So the path is evaluated twice: without evidence, to find where the car would park, and then
-    with the evidence of the observations there.
+    Going on is evidence that a slot was taken only where the car would park in it. So the path is evaluated twice:
+    without evidence, to find where the car would park, and then with the evidence of the observations there.
 
-    Returns:
-        The value, s, of driving on to the second stop, and the value from there of not parking there either; inf where
-        there is none.
+    Return the value, s, of driving on to the second stop, and that from there of not parking there either, or inf.
     """
     belief, n_stops = search.belief, path.state[0].n_stops
     if n_stops < 2:
@@ -573,10 +549,8 @@ def _stop_optimally(path: PathBuffer) -> tuple[float, float]:
             rest *= 1.0 - observation.p_free
             observation.rest, observation.value = rest, expected
         nothing = expected + rest * min(stop.stop_s, then_s)
-        in_mind_s, back_s = (
-            value_s[oldest:newest],
-            kept_s[stop.first_kept : stop.first_kept + newest - oldest],
-        )
+        in_mind_s = value_s[oldest:newest]
+        back_s = kept_s[stop.first_kept : stop.first_kept + newest - oldest]
         for i in range(len(in_mind_s)):
             later = onward + in_mind_s[i]
             in_mind_s[i] = back_s[i] if back_s[i] <= max(ahead_s, later) else later

@@ -147,10 +147,7 @@ class BeliefSnapshot(NamedTuple):
 
 @leaf
 def set_slots(belief: BeliefSnapshot, parts: FloatArray, p_occupied: FloatArray, drive_s: FloatArray) -> None:
-    """Fill in the records of the slots, except what was observed of them.
-
-    `parts` is that of `SlotBelief`, `p_occupied`, (n_slots,), P(taken) now, `drive_s`, (n_vertices,), from the car.
-    """
+    """Fill in all but what was observed, from `SlotBelief.parts`, P(taken) now and drives from the car, s."""
     n = len(belief.slots)
     for s in range(n):
         forecast, decay_rate, at = parts[s], parts[n + s], belief.slots[s]
@@ -195,7 +192,6 @@ class PathBuffer(NamedTuple):
 
 
 def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffer:
-    """Allocate the buffers for paths on a lot of a given size."""
     most_stops = min(4 * n_vertices + 16, MOST_STOPS)
     most_observations = n_slots + min(n_slots + 64, MOST_STOPS)
     return PathBuffer(
@@ -212,18 +208,15 @@ def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffer:
 
 @leaf
 def reset_weights(belief: BeliefSnapshot, path: PathBuffer) -> None:
-    """Set the scratch weights of a path to those of the belief."""
     for h in range(len(belief.weights)):
         path.weights[h] = belief.weights[h]
 
 
 @leaf
 def mean_over_days(weights: FloatArray, values: FloatArray) -> float:
-    """Return the mean of values, (k,), over the hypotheses with weights (k,).
-
-    Four sums at once take a fraction of the time of one, and unlike sums that the compiler splits up, they are the same
-    on every machine.
-    """
+    """Return the mean of values, (k,), over the hypotheses with weights (k,)."""
+    # Four sums at once take a fraction of the time of one, and unlike those that a compiler splits up, are the same on
+    # every machine.
     n = len(weights)
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for h in range(0, n - 3, 4):
@@ -266,10 +259,7 @@ def is_hidden(slot: int, rate: float, belief: BeliefSnapshot) -> bool:
 
 @leaf
 def needs_attempt(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
-    """Return whether only a parking attempt can show if the slot at a vertex is free.
-
-    That is the case if it is not known to be free and is not expected to be detected from its own vertex.
-    """
+    """Return whether only a parking attempt can show if the slot at a vertex is free: it is hidden even from there."""
     if vertex >= len(belief.slots) or belief.slots[vertex].state == OBSERVED_FREE:
         return False
     hidden: bool = is_hidden(vertex, graph.own_rate[vertex], belief)

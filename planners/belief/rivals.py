@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import dijkstra
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import require_number
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation
 from planners.belief.agent import BeliefAgent, BeliefSearch, Crowd
@@ -65,9 +65,7 @@ class BeliefRivalsAgent(BeliefAgent):
         arrivals_per_hour: rivals an hour; None: not known, then the driver infers them from the other cars in view, if
             cars are observed (`sees_cars` of `parkenv.engine.fleet.Fleet`), else it has only its taste. With 0 the
             agent is `belief`, action for action.
-        budget_ms: see `belief`.
-        day: see `belief`.
-        most_vertices: see `belief`.
+        budget_ms, day, most_vertices: see `belief`.
     """
 
     name: ClassVar[str] = "belief-rivals"
@@ -81,8 +79,8 @@ class BeliefRivalsAgent(BeliefAgent):
         most_vertices: int = MOST_VERTICES,
     ) -> None:
         super().__init__(problem, budget_ms, day, most_vertices)
-        if arrivals_per_hour is not None and not 0.0 <= arrivals_per_hour < math.inf:
-            raise InputError(f"arrivals_per_hour is {arrivals_per_hour}, want a finite number of at least 0")
+        if arrivals_per_hour is not None:
+            require_number("arrivals_per_hour", arrivals_per_hour, least=0.0)
         self.arrivals_per_hour = arrivals_per_hour
         lot = self.problem.lot
         drive_m = dijkstra(lot.drive_matrix(timed=True), indices=np.unique(lot.entry_vertices), min_only=True)
@@ -138,11 +136,8 @@ def _take_rates(
 ) -> FloatArray:
     """Return the rates at which rivals take each slot while it is free, (n_slots,) 1/s.
 
-    The rates are those of the equilibrium in which a slot becomes free at the forecast rate: then rivals find parking
-    at the rate at which they arrive, unless the lot is full.
-
-    `leaving`, (n_slots,) 1/s, is the rate at which a taken slot becomes free; where it is 0, nothing changes. `order`
-    has the best slots first; rivals come at `per_s` and pass `passed` free slots in the mean.
+    In equilibrium they find parking at the rate at which they arrive, unless the lot is full. Slots that nobody leaves,
+    with `leaving` 0 (n_slots,) 1/s, do not change. `order` has the best slots first; rivals pass `passed` free ones.
     """
     rates, n_better = np.zeros(len(p_free)), 0.0
     for s in order:

@@ -35,7 +35,7 @@ from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
-from planners.routes import RoadTable
+from planners.routes import RoadTable, edges_out, search
 
 MOST_SLOTS = 25  # maximum number of slots; the key of a belief state has room for no more
 MOST_STATES = 8_000_000  # default maximum number of belief states: about 200 MB, and twice that while solving
@@ -68,7 +68,6 @@ class Days(NamedTuple):
 
 
 def _grid(deviation: float, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return values of a normal distribution around 0 and their probabilities, (k,) each."""
     if deviation == 0.0:
         return np.zeros(1), np.ones(1)
     z = np.linspace(-_MOST_DEVIATIONS, _MOST_DEVIATIONS, count)
@@ -80,8 +79,7 @@ class _SmallLot(NamedTuple):
     """Data of a small lot for the dynamic program; sets of slots are bit masks."""
 
     shows: IntArray  # (n_vertices,) the slots in view of each vertex
-    neighbors: NDArray[np.int32]
-    move_s: FloatArray
+    edges: tuple[NDArray[np.int32], NDArray[np.int32], FloatArray]  # as `search` takes them
     drive_s: FloatArray  # (n_vertices, n_vertices) shortest drives
     cost_s: FloatArray  # (n_slots,) arrival cost
     dominated_by: IntArray  # (n_slots,) the slots that are at least as good as each one
@@ -166,10 +164,26 @@ class ExactSolution:
             return None
         return float(self._values[at]), int(self._choices[at])
 
-    def drives(self, vertex: int, seen: int) -> tuple[FloatArray, IntArray]:
-        """Return times, (n_vertices,) s, of drives that show nothing new, and the vertex before each on its drive."""
-        reach, came_from = _drive_within_known(vertex, seen, self._lot)
-        return reach, came_from
+    def toward(self, vertex: int, target: int, seen: int) -> int:
+        """Return the next vertex on a drive that shows nothing new before its end."""
+        start, leads_to, edge_s = self._lot.edges
+        source = np.repeat(np.arange(len(start) - 1), np.diff(start))
+        reach = self.drives(vertex, seen)
+        reach[vertex] = 0.0
+        walls = self._lot.shows & ~seen != 0
+        walls[vertex] = False
+        while True:
+            before = np.flatnonzero((leads_to == target) & ~walls[source])
+            seconds = reach[source[before]] + edge_s[before]
+            nearest = source[before[seconds == seconds.min()]]
+            nearest = nearest[np.argsort(reach[nearest], kind="stable")]
+            if nearest[0] == vertex:
+                return target
+            target = int(nearest[0])
+
+    def drives(self, vertex: int, seen: int) -> FloatArray:
+        """Return times, (n_vertices,) s, of drives that show nothing new before their end."""
+        return np.asarray(_drive_within_known(vertex, seen, self._lot))
 
     def _enumerate(self, root: int, most_states: int) -> None:
         """Find all states that can follow from the first one, in the order of the number of observed slots."""
@@ -193,28 +207,24 @@ class ExactSolution:
                         pending[more] = [np.unique(np.concatenate(pending[more]))]
             if total > most_states:
                 raise InputError(
-                    f"this lot has over {most_states} belief states, the limit of the exact planner: want fewer "
-                    f"slots than {n} (about 20 along one aisle, 16 along two, 11 where days differ), or a higher "
-                    "most_states"
+                    f"this lot has over {most_states} belief states: want fewer slots than {n} (about 20 along one "
+                    "aisle, 16 along two, 11 where days differ), or a higher most_states"
                 )
         self._keys = np.concatenate(levels_keys)
         self._levels = np.cumsum([0, *(len(keys) for keys in levels_keys)])
 
 
 def require_small(problem: SearchProblem) -> None:
-    """Raise an `InputError` if the lot is too large for the exact planner, or the sensor errs."""
     lot = problem.lot
     if lot.n_slots > MOST_SLOTS or lot.n_vertices > 1 << _POSITION_BITS:
         raise InputError(
-            f"lot {lot.name!r} has {lot.n_slots} slots and {lot.n_vertices} vertices; the exact planner takes at most "
-            f"{MOST_SLOTS} slots and {1 << _POSITION_BITS} vertices"
+            f"lot {lot.name!r} is too large for the exact planner, want at most {MOST_SLOTS} slots"
         )
     if not problem.sensor_model.perfect:
         raise InputError("the exact planner requires a sensor model without errors")
 
 
 def bits_of(slots: NDArray[np.bool_]) -> int:
-    """Return a set of slots, (n_slots,) bool, as a bit mask."""
     return int(sum(1 << int(s) for s in np.flatnonzero(slots)))
 
 
@@ -232,8 +242,8 @@ def _small_lot(problem: SearchProblem, days: Days, table: RoadTable) -> _SmallLo
     as_good &= len(days.chance) == 1
     dominated_by = np.array([bits_of(row) for row in as_good], dtype=np.int64)
     stay_s = np.where((lot.neighbors < 0).any(axis=1), problem.wait_s, np.inf)
-    edges = lot.neighbors, problem.move_cost_s, table.seconds
-    return _SmallLot(shows, *edges, cost, dominated_by, *days, problem.give_up_s, stay_s)
+    edges = edges_out(lot.neighbors, problem.move_cost_s)
+    return _SmallLot(shows, edges, table.seconds, cost, dominated_by, *days, problem.give_up_s, stay_s)
 
 
 @compiled
@@ -243,7 +253,6 @@ def _key(seen: int, vertex: int, free: int, n: int) -> int:
 
 @compiled
 def _state(key: int, n: int) -> tuple[int, int, int]:
-    """Return the slots seen, the vertex and the slots observed free of a key."""
     group = key >> n
     return group >> _POSITION_BITS, group & ((1 << _POSITION_BITS) - 1), key & ((1 << n) - 1)
 
@@ -268,40 +277,23 @@ def _without_dominated(free: int, dominated_by: IntArray) -> int:
 
 
 @compiled
-def _drive_within_known(vertex: int, seen: int, lot: _SmallLot) -> tuple[FloatArray, IntArray]:
+def _drive_within_known(vertex: int, seen: int, lot: _SmallLot) -> FloatArray:
     """Return drive times, s, through vertices that show nothing new, to these vertices and to the frontier.
 
     If the car has not observed from its start vertex yet, the time to that vertex is that of the shortest step that
-    ends there: a wait or a round trip. Also return the vertex before each on its drive, or -1.
+    ends there: a wait or a round trip.
     """
-    n_vertices = len(lot.shows)
-    reach, came_from = np.full(n_vertices, np.inf), np.full(n_vertices, -1)
-    done = np.zeros(n_vertices, np.bool_)
-    reach[vertex] = 0.0
-    again = lot.stay_s[vertex]
-    while True:
-        best, v = np.inf, -1
-        for u in range(n_vertices):
-            if not done[u] and reach[u] < best:
-                best, v = reach[u], u
-        if v < 0:
-            break
-        done[v] = True
-        if lot.shows[v] & ~seen and v != vertex:
-            continue
-        for m in range(lot.neighbors.shape[1]):
-            u = lot.neighbors[v, m]
-            if u < 0:
-                continue
-            seconds = best + lot.move_s[v, m]
-            if u == vertex:
-                again = min(again, seconds)
-            elif seconds < reach[u]:
-                reach[u] = seconds
-                came_from[u] = v
-    if lot.shows[vertex] & ~seen:
-        reach[vertex] = again
-    return reach, came_from
+    reach, shows_new = np.full(len(lot.shows), np.inf), (lot.shows & ~seen) != 0
+    is_new, shows_new[vertex] = shows_new[vertex], False
+    start, leads_to, edge_s = lot.edges
+    search(start, leads_to, edge_s, vertex, shows_new[:0], shows_new, reach)
+    if is_new:
+        reach[vertex] = lot.stay_s[vertex]
+        for v in range(len(reach)):
+            for e in range(start[v], start[v + 1]):
+                if leads_to[e] == vertex and v != vertex and not shows_new[v]:
+                    reach[vertex] = min(reach[vertex], reach[v] + edge_s[e])
+    return reach
 
 
 @compiled
@@ -324,7 +316,7 @@ def _successors(keys: IntArray, lot: _SmallLot) -> IntArray:
         seen, vertex, free = _state(keys[i], n)
         if keys[i] >> n != previous:
             previous = keys[i] >> n
-            reach, _ = _drive_within_known(vertex, seen, lot)
+            reach = _drive_within_known(vertex, seen, lot)
             least = _least_cost(~seen, lot.drive_s[vertex], lot.cost_s)
         best = _least_cost(free, reach, lot.cost_s)
         if best <= min(least, _least_cost(free, lot.drive_s[vertex], lot.cost_s)):
@@ -379,7 +371,7 @@ def _back_up(
             day /= day.sum()
         if keys[i] >> n != previous:
             previous = keys[i] >> n
-            reach, _ = _drive_within_known(vertex, seen, lot)
+            reach = _drive_within_known(vertex, seen, lot)
             least = _least_cost(~seen, lot.drive_s[vertex], lot.cost_s)
             low[:] = -1
         best = _least_cost(free, reach, lot.cost_s)
@@ -465,7 +457,6 @@ class ExactAgent(SearchAgent[ExactState]):
         )
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: ExactState) -> int:
-        """Drive to the next vertex to observe from, or to the chosen slot, and park there."""
         vertex = int(observation["vertex"])
         seen, free = bits_of(belief.observed), bits_of(belief.observed_free)
         undecided = memory.target == _UNDECIDED or vertex == memory.target
@@ -477,17 +468,15 @@ class ExactAgent(SearchAgent[ExactState]):
                 decision = memory.solution.decide(seen, vertex, free)
                 assert decision is not None
             memory.target = decision[1]
-        reach, came_from = memory.solution.drives(vertex, memory.seen)
         target = memory.target
         if target == _SEARCH_ENDS:
             if not free:
                 return self.wait(vertex)
+            reach = memory.solution.drives(vertex, memory.seen)
             arrival_s = reach[: self.problem.lot.n_slots] + self.problem.arrival_cost_s
             target = int(np.where(belief.observed_free, arrival_s, np.inf).argmin())
             if target == vertex:
                 return PARK
         elif target == vertex:
             return self.wait(vertex)
-        while came_from[target] != vertex:
-            target = int(came_from[target])
-        return self.table.move_to(vertex, target)
+        return self.table.move_to(vertex, memory.solution.toward(vertex, target, memory.seen))

@@ -12,7 +12,7 @@ from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, PlanPreview, SearchAgent
+from planners.agent import Observation, SearchAgent
 from planners.routes import DriveRoutes
 
 _ASKED_AT_ONCE = 64  # slots, in one question to a world
@@ -38,13 +38,7 @@ def best_slot(
     the two. With `wait_s` above 0 the car waits in steps of that length, as in the environment, and misses a slot that
     is free only between two steps.
 
-    Args:
-        problem: lot, goal, speeds and costs.
-        routes: shortest drives on that lot.
-        world: the hidden occupancy of the episode.
-        vertex: where the car is.
-        time: current time, s since Monday 00:00.
-        wait_s: s, the length of one wait; 0 for any length.
+    The car is at `vertex` at `time`, s since Monday 00:00.
     """
     arrival = time + routes.seconds_from(vertex)[: problem.lot.n_slots]
     cost_s = problem.arrival_cost_s
@@ -71,7 +65,7 @@ def _first_free(
 ) -> float:
     """Return the first time, s, at `arrival` or whole waits later, when the slot is free; inf if after `latest`.
 
-    `free_from`, s, is the first time from some earlier moment on: if it is after the arrival, it is the answer then.
+    `free_from`, s, is the first time from some earlier moment on.
     """
     slots = np.array([slot])
     moment = arrival
@@ -115,7 +109,6 @@ class OracleAgent(SearchAgent[OracleState]):
         self._world, self._time = world, time
 
     def begin(self, observation: Observation, belief: SlotBelief) -> OracleState:
-        del belief
         if self._world is None:
             raise RuntimeError("the oracle was not shown the world: call prepare(world, time) after reset()")
         vertex, give_up_s = int(observation["vertex"]), self.problem.give_up_s
@@ -129,7 +122,6 @@ class OracleAgent(SearchAgent[OracleState]):
         return OracleState(best.slot, waits + self._extra_waits(vertex, best.slot, waits) if waits else 0)
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: OracleState) -> int:
-        """Wait, drive to the slot and park when it is free; or continue the tour."""
         assert self._world is not None
         vertex, now = int(observation["vertex"]), self._time + belief.time
         can_wait = not observation["action_mask"][: len(MOVES)].all()
@@ -151,15 +143,13 @@ class OracleAgent(SearchAgent[OracleState]):
             return self.routes.move_toward(vertex, memory.slot)
         return PARK if self._world.next_free(np.array([vertex]), now)[0] <= now else wait
 
-    def plan_preview(self, observation: Observation, action: int, memory: OracleState) -> PlanPreview:
-        del action
-        return PlanPreview(self.routes.path(int(observation["vertex"]), memory.slot))
+    def plan_preview(self, observation: Observation, action: int, memory: OracleState) -> tuple[int, ...]:
+        return self.routes.path(int(observation["vertex"]), memory.slot)
 
     def _extra_waits(self, vertex: int, slot: int, waits: int) -> int:
         """Return the number of extra waits so that it never observes the whole lot taken, which would end the search.
 
-        It waits before it drives, so observations on the way matter only if the route shows every slot: then the target
-        must be free when it comes into view, not just on arrival.
+        If the route shows every slot, the target must be free when it comes into view, not just on arrival.
         """
         assert self._world is not None
         shown = np.zeros(self.problem.lot.n_slots, dtype=np.bool_)

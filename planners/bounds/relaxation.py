@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError, require_whole
 from parkenv.world.occupancy.process import SlotLaw, World
@@ -40,8 +39,7 @@ MOST_SLOTS = 240
 """Slots in groups, those with the least drive and walk. To park elsewhere costs at least as much as the next one."""
 MOST_STATES = 4_000
 """Most pairs of a set of seen groups and the vertex where the last came into view: so fine are the groups."""
-FINE_S = 25.0
-"""s by which a slot must be worse than the best one for a group to be e times as wide there."""
+FINE_S = 25.0  # s by which a slot must be worse than the best one for a group to be e times as wide there
 PERIODS = np.array([0.1, 0.25, 0.5, 1.0, 2.0, 4.0])
 """Ends of the periods of waiting that `value` tells apart, in units of what a search takes if nothing is found."""
 _MOST_GROUPS = 62  # bits of a set
@@ -87,14 +85,6 @@ class _News(NamedTuple):
     group: IntArray  # (n,) of each slot
 
 
-class _World(NamedTuple):
-    """The slots in groups in one world."""
-
-    group: IntArray  # (n,) the group of each slot
-    free_s: FloatArray  # (n,) s, when each slot is free first that a car can have reached
-    cost_s: FloatArray  # (n,) s, arrival cost
-
-
 class SearchBound:
     """`bound`: what every agent takes at least in the mean. It drives no car.
 
@@ -114,21 +104,13 @@ class SearchBound:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
-        """Raise an `InputError`: it is compared with agents, and is none."""
-        del observation, state, episode_start, deterministic
-        raise InputError(
-            "bound drives no car: it is what agents take at least; want it in parkenv compare alone"
-        )
+        raise InputError("bound drives no car: it is what agents take at least; want it in parkenv compare")
 
     def of_world(self, world: World, vertex: int, time: float) -> float:
         """Return the bound of one world, s; their mean is the bound, a single search may take less.
 
-        Where the law of the slots is not known, as in a log, it is the clairvoyant bound.
-
-        Args:
-            world: the occupancy.
-            vertex: where the search begins.
-            time: when, s since Monday 00:00: the arrival of the world.
+        Where the law of the slots is not known, as in a log, it is the clairvoyant bound. The search begins at `vertex`
+        at `time`, s since Monday 00:00.
         """
         law = world.law()
         if law is None:
@@ -189,9 +171,10 @@ class SearchBound:
             n_states += len(gates[known])
             if n_states > self._most_states and group.any():
                 return None
-            edges = lot.neighbors, self._problem.move_cost_s
-            seconds = np.array([_drive_in_sight(v, known, shows, *edges) for v in gates[known]])
-            new = np.flatnonzero(np.isfinite(seconds.min(axis=0)) & (shows & ~known != 0))
+            # Drives end where they show something new.
+            shows_new = shows & ~known != 0
+            seconds = np.array([self._routes.seconds_from(v, shows_new) for v in gates[known]])
+            new = np.flatnonzero(np.isfinite(seconds.min(axis=0)) & shows_new)
             following = [(known | int(shows[v]), int(v)) for v in new]
             for more, v in following:
                 if more not in gates:
@@ -230,9 +213,8 @@ class SearchBound:
         cost_s = self._problem.arrival_cost_s[start.slots]
         p_taken = law.p_taken_after(after)
         nothing_s = float(after.mean()) + _wait_s(p_taken * law.leaving[0], cost_s)
-        ends = after + np.minimum(
-            PERIODS[:, None] * nothing_s, law.known_for_s - after
-        )  # (k, n) of periods of waiting
+        # (k, n) of periods of waiting
+        ends = after + np.minimum(PERIODS[:, None] * nothing_s, law.known_for_s - after)
         stays = law.stays(after, np.vstack([after, ends]))
         chance = np.vstack([1.0 - p_taken, p_taken * -np.diff(stays, axis=0)])
         slot, period = np.divmod(np.flatnonzero(chance.T > 0.0), len(chance))
@@ -245,10 +227,9 @@ class SearchBound:
         # Time left at a state if the car goes to a slot that is free from a moment on; no news: infinite
         left_s = np.full((len(ways.earliest_s), len(slot) + 1), np.inf, np.float32)
         left_s[:, :-1] = np.maximum(ways.direct_s[:, slot], from_s - ways.earliest_s[:, None]) + cost_s[slot]
-        world = _World(start.group, free, cost_s)
         longest_s = min((PERIODS[-1] + 1.0) * nothing_s, self._problem.give_up_s)
         penalty = _penalties(ways, news, left_s, longest_s, revealed[np.arange(len(after)), now])
-        return float(_least_s(ways, penalty, world, start.beyond_s, self._problem.give_up_s))
+        return float(_least_s(ways, penalty, start, free, cost_s, self._problem.give_up_s))
 
 
 def _wait_s(freed: FloatArray, cost_s: FloatArray) -> float:
@@ -261,32 +242,9 @@ def _wait_s(freed: FloatArray, cost_s: FloatArray) -> float:
 
 
 @compiled(error_model="numpy")
-def _drive_in_sight(
-    vertex: int, known: int, shows: IntArray, neighbors: NDArray[np.int32], move_s: FloatArray
-) -> FloatArray:
-    """Return the drive, (n_vertices,) s, to vertices that show nothing new, and to those after them, where it ends."""
-    seconds = np.full(len(shows), np.inf)
-    keys, items, size = np.empty(4 * len(shows) + 1), np.empty(4 * len(shows) + 1, np.int32), 0
-    seconds[vertex] = 0.0
-    size = push(keys, items, size, 0.0, vertex)
-    while size > 0:
-        v, so_far = items[0], keys[0]
-        size = pop(keys, items, size)
-        if so_far > seconds[v] or shows[v] & ~known:
-            continue
-        for move in range(neighbors.shape[1]):
-            u = neighbors[v, move]
-            if u >= 0 and so_far + move_s[v, move] < seconds[u]:
-                seconds[u] = so_far + move_s[v, move]
-                size = push(keys, items, size, seconds[u], u)
-    return seconds
-
-
-@compiled(error_model="numpy")
 def _earliest(
     first: IntArray, first_next: IntArray, next_state: IntArray, first_drive: IntArray, drive_s: FloatArray
 ) -> FloatArray:
-    """Return the least time to each state, (n_states,) s."""
     earliest = np.full(first[-1], np.inf)
     earliest[0] = 0.0
     for k in range(len(first) - 1):
@@ -322,7 +280,7 @@ def _penalties(
         n_next = ways.first_next[k + 1] - ways.first_next[k]
         for i in range(n_next):
             y = ways.next_state[ways.first_next[k] + i]
-            of_set = _set_of(y, ways)
+            of_set = ways.sets[np.searchsorted(ways.first, y, side="right") - 1]
             order, mean, rest = _mean_value(of_set & ~ways.sets[k], left_s[y], value[y], news)
             best_s = left_s[y][order]
             for at in range(n_seen + 1):
@@ -343,26 +301,28 @@ def _penalties(
 
 
 @compiled(error_model="numpy")
-def _least_s(ways: _Ways, penalty: FloatArray, world: _World, beyond_s: float, give_up_s: float) -> float:
-    """Return the least time of a car that knows the world and pays the penalties, see `_penalties`.
+def _least_s(
+    ways: _Ways, penalty: FloatArray, start: _Start, free_s: FloatArray, cost_s: FloatArray, give_up_s: float
+) -> float:
+    """Return the least time of a car that knows when each slot is free, (n,) s, and pays the penalties of `_penalties`.
 
-    It may park in a slot without a group, from `beyond_s` on, or pay `give_up_s` where all groups have been seen.
+    It may park in a slot without a group, or pay `give_up_s` where all groups have been seen.
     """
     total_s, penalty_s = np.full(len(ways.earliest_s), np.inf), np.full(len(ways.earliest_s), np.inf)
     every, least = 0, np.inf
-    for group in world.group:
+    for group in start.group:
         every |= 1 << group
     # Before anything is seen, the car is where the first state is.
     total_s[0] = penalty_s[0] = penalty[-1]
     for k in range(len(ways.sets)):
         for x in range(ways.first[k], ways.first[k + 1]):
-            least = min(least, beyond_s + penalty_s[x])
+            least = min(least, start.beyond_s + penalty_s[x])
             if ways.sets[k] == every:
                 least = min(least, total_s[x] + give_up_s)
-            for s in range(len(world.free_s)):
+            for s in range(len(free_s)):
                 if ways.slot_s[x, s] < np.inf:
-                    parked_s = max(total_s[x] + ways.slot_s[x, s], world.free_s[s] + penalty_s[x])
-                    least = min(least, parked_s + world.cost_s[s])
+                    parked_s = max(total_s[x] + ways.slot_s[x, s], free_s[s] + penalty_s[x])
+                    least = min(least, parked_s + cost_s[s])
         n_next = ways.first_next[k + 1] - ways.first_next[k]
         for i in range(n_next):
             edge = ways.first_next[k] + i
@@ -382,11 +342,6 @@ def _best_revealed(known: int, left_s: NDArray[np.float32], news: _News, reveale
         if (known >> news.group[s]) & 1 and left_s[revealed[s]] < left_s[best]:
             best = revealed[s]
     return int(best)
-
-
-@compiled(error_model="numpy")
-def _set_of(state: int, ways: _Ways) -> int:
-    return int(ways.sets[np.searchsorted(ways.first, state, side="right") - 1])
 
 
 @compiled(error_model="numpy")

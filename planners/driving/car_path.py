@@ -28,18 +28,11 @@ class CarPath:
 
     @property
     def driven_m(self) -> float:
-        """Length, m."""
         return float(np.abs(self.length).sum())
 
     @property
     def direction_changes(self) -> int:
-        """Number of changes between forward and backward."""
         return count_changes(self.length[np.abs(self.length) > SHORTEST_ARC])
-
-    @property
-    def turned_rad(self) -> float:
-        """Total absolute change of heading, rad: a measure of smoothness."""
-        return float(np.abs(self.length * self.curvature).sum())
 
     def reversed(self, start: FloatArray) -> CarPath:
         """Return the path driven the other way, from its end, `start`, (3,)."""
@@ -61,7 +54,6 @@ class CarPath:
 
 
 def count_changes(values: FloatArray) -> int:
-    """Return how often the sign changes from one value to the next, (n,)."""
     return int(np.count_nonzero(np.diff(np.sign(values))))
 
 
@@ -93,7 +85,6 @@ def rounded(points: FloatArray, radius: float) -> CarPath:
 
 
 def joined(first: CarPath, second: CarPath) -> CarPath:
-    """Concatenate two paths; the second starts where the first ends."""
     return CarPath(
         first.start,
         np.r_[first.length, second.length],

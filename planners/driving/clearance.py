@@ -11,10 +11,12 @@ from scipy.ndimage import distance_transform_edt
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from parkenv.driving.vehicle import VehicleParameters
+from parkenv.driving.vehicle import VehicleParameters, move_along
 
 CELL_M = 0.1  # cell of the distance field, m
 _BEYOND_M = 3.0  # distance, m, by which a car may reach beyond the window
+CHECK_M, FINE_M = 0.15, 0.015  # maximum distance, m, between checked poses, and that without any clearance
+ROOMY_M = 0.045  # clearance, m, from which on the first one is enough
 DISCS = 4  # number of discs in a row that cover the footprint
 
 _SAMPLE_M = 0.5 * CELL_M
@@ -196,3 +198,43 @@ def room_at(space: Clearance, x: float, y: float, yaw: float, most: float) -> fl
         else:
             high = middle
     return low
+
+
+@compiled(error_model="numpy")
+def _check_every(margin: float) -> float:
+    """Return the distance between checked poses, m: corners that pass each other in between overlap little."""
+    return CHECK_M if margin >= ROOMY_M else max(1.5 * margin, FINE_M)
+
+
+@compiled(error_model="numpy")
+def arc_is_free(
+    space: Clearance, x: float, y: float, yaw: float, curvature: float, way: float, margin: float
+) -> bool:
+    """Return whether the car, grown by `margin` m, is collision-free along an arc of `way` m."""
+    n = max(1, math.ceil(abs(way) / _check_every(margin)))
+    for i in range(1, n + 1):
+        px, py, pyaw = move_along(x, y, yaw, curvature, way * i / n)
+        if not is_collision_free(space, px, py, pyaw, margin):
+            return False
+    return True
+
+
+@compiled(error_model="numpy")
+def free_length(
+    space: Clearance, x: float, y: float, yaw: float, curvature: float, most: float, margin: float
+) -> float:
+    """Return how far, m, up to `most`, the car, grown by `margin` m, may drive along an arc; both negative backward."""
+    n = math.ceil(abs(most) / _check_every(margin))
+    for i in range(1, n + 1):
+        px, py, pyaw = move_along(x, y, yaw, curvature, most * i / n)
+        if not is_collision_free(space, px, py, pyaw, margin):
+            free, blocked = most * (i - 1) / n, most * i / n
+            for _ in range(5):
+                middle = 0.5 * (free + blocked)
+                px, py, pyaw = move_along(x, y, yaw, curvature, middle)
+                if is_collision_free(space, px, py, pyaw, margin):
+                    free = middle
+                else:
+                    blocked = middle
+            return float(free)
+    return most

@@ -10,24 +10,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
+from pydantic import AfterValidator, Field
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import VehicleParameters, move_along
-from parkenv.errors import InputError, require_number, require_whole
+from parkenv.files.field_types import NotNegative, Number, Validated, Whole
 from planners.driving.car_path import CarPath
-from planners.driving.clearance import CELL_M, Clearance, clearance, room_at
-from planners.driving.reeds_shepp import PIECES, Words, distance_between, words_buffer
-from planners.driving.reeds_shepp_shots import (
+from planners.driving.clearance import CELL_M, Clearance, arc_is_free, clearance, free_length, room_at
+from planners.driving.reeds_shepp import (
+    PIECES,
     DriveCosts,
-    arc_is_free,
+    Words,
     cheapest_shot,
-    free_length,
+    distance_between,
     shorten_path,
+    words_buffer,
 )
 
 WINDOW_M = 9.0
@@ -42,16 +44,19 @@ _TIGHT_CELL_M, _TIGHT_YAW_CELLS, _FINE_BELOW_M = 0.02, 720, 0.01  # halved where
 _SHORTEST_M, _LONGEST_M = 0.02, 1.5  # of moves that end where the car would touch something
 
 
-class Limits(NamedTuple):
-    """Greed and limits of one attempt; as in `SearchSettings`."""
+def _a_move(metres: float) -> float:
+    if not (metres == 0.0 or 0.05 <= metres <= 2.0):
+        raise ValueError("a move of 0 or 0.05 to 2 m")
+    return metres
 
-    greed: float
-    most_expansions: int
-    patience: float
+
+Attempts = Annotated[
+    tuple[tuple[NotNegative, Annotated[Number, AfterValidator(_a_move)]], ...], Field(min_length=1)
+]
 
 
 @dataclass(frozen=True)
-class SearchSettings:
+class SearchSettings(Validated):
     """Costs and limits of the search.
 
     Args:
@@ -69,28 +74,15 @@ class SearchSettings:
         InputError: a value out of its range.
     """
 
-    change_m: float = 3.0
-    steer_m: float = 0.4
-    reserve: float = 0.06
-    attempts: tuple[tuple[float, float], ...] = (
+    change_m: NotNegative = 3.0
+    steer_m: NotNegative = 0.4
+    reserve: NotNegative = 0.06
+    attempts: Attempts = (
         (0.20, 0.5), (0.10, 0.5), (0.05, 0.5), (0.05, 0.0), (0.02, 0.0), (0.01, 0.0),
     )  # fmt: skip
-    greed: float = 1.3
-    most_expansions: int = 20_000
-    patience: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("change_m", "steer_m", "reserve", "patience"):
-            require_number(f"search {name}", getattr(self, name), least=0.0)
-        require_number("search greed", self.greed, least=1.0)
-        require_whole("search most_expansions", self.most_expansions, least=1)
-        if not self.attempts or any(
-            margin < 0.0 or not (move == 0.0 or 0.05 <= move <= 2.0) for margin, move in self.attempts
-        ):
-            raise InputError(
-                f"search attempts are {self.attempts!r}, want pairs of a margin, 0 m or more, and a move, 0 or "
-                "0.05 to 2 m"
-            )
+    greed: Annotated[Number, Field(ge=1.0)] = 1.3
+    most_expansions: Annotated[Whole, Field(ge=1)] = 20_000
+    patience: NotNegative = 1.0
 
 
 def plan_path(
@@ -136,7 +128,7 @@ def plan_path(
         left = _grid_distances(space, start[0], start[1], space.half[1] + margin)
         costs = DriveCosts(radius, margin, settings.change_m, settings.steer_m)
         goal = np.array(start, dtype=np.float64)
-        limits = Limits(settings.greed, settings.most_expansions, settings.patience)
+        limits = settings.greed, settings.most_expansions, settings.patience
         lengths, curvatures, opened = _search(space, left, origin, goal, costs, move, limits)
         expansions += opened
         if len(lengths):
@@ -206,7 +198,7 @@ def _search(
     end: FloatArray,
     costs: DriveCosts,
     move: float,
-    limits: Limits,
+    limits: tuple[float, int, float],
 ) -> tuple[FloatArray, FloatArray, int]:
     """Run hybrid A*; return lengths, m, and curvatures, 1/m, of the arcs from start to end, and the expansions."""
     # Best node per cell and direction of arrival, in a hash table. In a tight slot moves shift the car sideways by
@@ -229,7 +221,8 @@ def _search(
 
     pose[0], cost[0], parent[0], way[0], steering[0] = start, 0.0, -1, 0.0, 0.0
     n, size = 1, push(keys, queue, 0, 0.0, 0)
-    opened, last = 0, limits.most_expansions
+    greed, last, patience = limits
+    opened = 0
     while size > 0 and opened < last and n < _MOST_NODES - 16:
         key, node = keys[0], queue[0]
         size = pop(keys, queue, size)
@@ -245,7 +238,7 @@ def _search(
             word, more = cheapest_shot(space, pose[node], end, costs, way[node], steering[node], below, words)
             if word >= 0:
                 if shot_node < 0:
-                    last = min(last, opened + int(limits.patience * opened) + 32)
+                    last = min(last, opened + int(patience * opened) + 32)
                 best, shot_node, shot_count = cost[node] + more, node, words.n_pieces[word]
                 for i in range(len(shot_piece)):
                     shot_piece[i], shot_turn[i] = words.piece[word, i], words.turn[word, i]
@@ -289,7 +282,7 @@ def _search(
                 cost[n], parent[n], way[n], steering[n] = g, node, length, share
                 if old >= 0:
                     closed[old] = True
-                size = push(keys, queue, size, g + limits.greed * h, n)
+                size = push(keys, queue, size, g + greed * h, n)
                 n += 1
     if shot_node < 0:
         return np.empty(0), np.empty(0), opened

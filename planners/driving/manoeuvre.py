@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -13,29 +13,23 @@ from typing import NamedTuple
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.driving.crossings import CrossingTraffic, caused_contact
-from parkenv.driving.encounters import encounter_times
+from parkenv.driving.road_users import CrossingTraffic, caused_contact, is_blocked
 from parkenv.driving.scene import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, FootprintCheck, Scene
-from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
+from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, advance
 from planners.driving.car_path import CarPath, count_changes
-from planners.driving.clearance import Clearance, clearance, room_at
+from planners.driving.clearance import Clearance, clearance, free_length, room_at
 from planners.driving.hybrid_astar import WINDOW_M, SearchSettings, plan_path
 from planners.driving.path_tracking import PathTracker, TrackingSettings
-from planners.driving.reeds_shepp_shots import free_length
 
 SEARCH = SearchSettings(
-    greed=2.0,
-    patience=0.3,
-    most_expansions=8_000,
-    attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.04, 0.5)),
+    greed=2.0, patience=0.3, most_expansions=8_000, attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.04, 0.5))
 )
 """Settings of the search in scenes: long moves first, and a path soon rather than the shortest."""
 TIGHT = dataclasses.replace(SEARCH, most_expansions=6_000, attempts=((0.04, 0.0), (0.02, 0.0), (0.01, 0.0)))
 """Settings of the search out of the tightest slots."""
 FINEST = dataclasses.replace(SEARCH, most_expansions=12_000, attempts=((0.008, 0.0), (0.004, 0.0)))
 """Settings of the last search, out of slots hardly longer than the car."""
-WIDE_M = 25.0
-"""Margin, m, around start and target of the search for ways around."""
+WIDE_M = 25.0  # margin, m, around start and target of the search for ways around
 EXACT = TrackingSettings(
     speed=0.8, reverse_speed=0.8, acceleration=0.6, firmness=2.5, control_s=PHYSICS_S, stops=True
 )
@@ -69,12 +63,10 @@ class Manoeuvre:
 
     @property
     def length_m(self) -> float:
-        """Distance driven, m."""
         return float(np.hypot(*np.diff(self.states[:, :2], axis=0).T).sum())
 
     @property
     def direction_changes(self) -> int:
-        """Number of changes between forward and backward."""
         return count_changes(self.states[self.states[:, SPEED] != 0.0, SPEED])
 
     @cached_property
@@ -110,14 +102,13 @@ class Judgement(NamedTuple):
         return self.driven, self.driven and far <= _SURE, min(self.clearance_m, _CLOSE_M)
 
 
-def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None) -> Manoeuvre:
+def park(scene: Scene) -> Manoeuvre:
     """Plan a path from a scene's start to its target, and drive it.
 
     The car is driven fluently; where that would touch something or end too far from the target, it is driven anew
     and stops to turn its wheels, or on another path. The planner knows the vehicle's model, so it finds that out first.
-    `plan` yields paths; `paths_in_scene` if None.
     """
-    paths, planning_s, tried = (plan or paths_in_scene)(scene), 0.0, list[Manoeuvre]()
+    paths, planning_s, tried = paths_in_scene(scene), 0.0, list[Manoeuvre]()
     while not any(manoeuvre.judged.driven for manoeuvre in tried):
         began = time.perf_counter()
         path = next(paths, None)
@@ -126,21 +117,18 @@ def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None)
             break
         for tracking in (TrackingSettings(), EXACT):
             states, others = drive(scene, path, tracking)
-            made = Manoeuvre(scene, path, states, planning_s, others)
-            if made.judged.score == (True, True, _CLOSE_M):
-                return made
-            tried.append(made)
+            manoeuvre = Manoeuvre(scene, path, states, planning_s, others)
+            if manoeuvre.judged.score == (True, True, _CLOSE_M):
+                return manoeuvre
+            tried.append(manoeuvre)
     if not tried:
         start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
         return Manoeuvre(scene, None, start[None], planning_s)
-    return max(tried, key=lambda made: made.judged.score)
+    return max(tried, key=lambda manoeuvre: manoeuvre.judged.score)
 
 
 def paths_in_scene(scene: Scene) -> Iterator[CarPath]:
-    """Yield paths from a scene's start to its target, of one search after the other.
-
-    A search is short that begins where the car has the least room, so that end comes first.
-    """
+    """Yield paths from a scene's start to its target: a search is short that begins where there is the least room."""
     start, end = scene.start, aim(scene)
     ways = _free_way(scene, start), _free_way(scene, end)
     forward = ways[1] <= ways[0]
@@ -214,7 +202,9 @@ def drive(scene: Scene, path: CarPath, tracking: TrackingSettings) -> tuple[Floa
         pedal, wheels = tracker.command(state[:3], float(state[SPEED]), float(state[STEERING]))
         if tracker.done:
             break
-        if traffic is not None and _has_to_wait(vehicle, tracker, traffic, float(state[SPEED])):
+        if traffic is not None and is_blocked(
+            vehicle, tracker.middle_ahead(float(state[SPEED])), traffic.outlines, traffic.velocity
+        ):
             slower = min(_BRAKING, abs(state[SPEED]) / tracking.control_s) / vehicle.max_braking
             pedal = -math.copysign(min(slower, 1.0), state[SPEED]) if state[SPEED] else 0.0
         for _ in range(round(tracking.control_s / PHYSICS_S)):
@@ -224,11 +214,3 @@ def drive(scene: Scene, path: CarPath, tracking: TrackingSettings) -> tuple[Floa
         brake = min(1.01 * abs(state[SPEED]) / (vehicle.max_braking * PHYSICS_S), 1.0)
         move(-math.copysign(brake, state[SPEED]), state[STEERING] / vehicle.max_steering)
     return np.array(states), np.array(others) if others else None
-
-
-def _has_to_wait(
-    vehicle: VehicleParameters, tracker: PathTracker, traffic: CrossingTraffic, speed: float
-) -> bool:
-    """Return whether a road user is in the way, now or soon."""
-    own = tracker.middle_ahead(speed)
-    return bool(np.isfinite(encounter_times(vehicle, own, traffic.outlines, traffic.velocity)).any())

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.driving.encounters import encounter_times
+from parkenv.driving.road_users import is_blocked
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
 from planners.agent import predict_each
@@ -87,22 +87,11 @@ class ParkingAgent:
         episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], Any]:
-        """Decide on single observations, or on batches with a leading axis (stable-baselines3's interface).
-
-        Args:
-            observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
-            state: returned by the previous call; None at the start.
-            episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
-                `state` is None.
-            deterministic: for the interface; a planner always is.
-
-        Returns:
-            The action, (2,) or (n_envs, 2) float32, and the state for the next call.
+        """Return the action, (2,) float32, and the state for the next call, as `Agent.predict`; or those of a batch.
 
         Raises:
             InputError: an observation without the obstacle map, or of another vehicle than the agent's.
         """
-        del deterministic
         self.require_map(observation)
         return predict_each(self._predict_one, observation, "achieved_goal", 1, state, episode_start)
 
@@ -122,16 +111,10 @@ class ParkingAgent:
         self.vehicle.require_same(observation["vehicle"], f"agent {self.name!r}")
 
     def plan(self, observation: Observation, *, around_others: bool = False) -> CarPath | None:
-        """Plan a path from the current pose to the desired one, in the slot's frame; return None if none was found.
-
-        Args:
-            observation: an observation with the obstacle map.
-            around_others: whether moving road users count as obstacles at their current positions.
-        """
+        """Plan a path to the desired pose, in the slot's frame, or None; road users stand still, or are not there."""
         return plan_path(*self._task(observation, around_others), self.search)
 
     def _task(self, observation: Observation, around_others: bool) -> _Task:
-        """Return what a path is planned for: car, outlines, numbers of corners, start and target."""
         cars = observation["cars"]
         if around_others:
             cars = np.concatenate([cars, observation["movers"]])
@@ -189,9 +172,7 @@ class ParkingAgent:
         before, memory.others = memory.others, at
         velocity = np.zeros_like(at) if before is None else (at - before) / _CONTROL_S
         assert memory.tracker is not None
-        own = memory.tracker.middle_ahead(speed)
-        when = encounter_times(self.vehicle, own, outlines, velocity)
-        return bool(np.isfinite(when).any())
+        return is_blocked(self.vehicle, memory.tracker.middle_ahead(speed), outlines, velocity)
 
 
 def _pose(goal: NDArray[np.float32]) -> FloatArray:

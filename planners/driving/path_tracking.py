@@ -16,9 +16,9 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
-from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED
+from parkenv.driving.road_users import PREDICTION_TIMES_S, START_SPEED
 from parkenv.driving.vehicle import VehicleParameters, move_along
-from parkenv.errors import require_number
+from parkenv.files.field_types import Positive, Validated
 from planners.driving.car_path import CarPath
 
 SAMPLE_M = 0.05
@@ -26,7 +26,7 @@ SAMPLE_M = 0.05
 
 
 @dataclass(frozen=True)
-class TrackingSettings:
+class TrackingSettings(Validated):
     """Speeds and gains of path tracking.
 
     Args:
@@ -41,17 +41,13 @@ class TrackingSettings:
         InputError: a value that is not a finite number above 0.
     """
 
-    speed: float = 2.2
-    reverse_speed: float = 1.5
-    acceleration: float = 1.2
-    firmness: float = 1.3
-    blend_m: float = 0.6
-    control_s: float = 0.1
+    speed: Positive = 2.2
+    reverse_speed: Positive = 1.5
+    acceleration: Positive = 1.2
+    firmness: Positive = 1.3
+    blend_m: Positive = 0.6
+    control_s: Positive = 0.1
     stops: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("speed", "reverse_speed", "acceleration", "firmness", "blend_m", "control_s"):
-            require_number(f"tracking {name}", getattr(self, name), above=0.0)
 
     def within(self, vehicle: VehicleParameters) -> Self:
         """Return the same within the limits of a vehicle, with some acceleration left for feedback."""
@@ -219,8 +215,8 @@ def _segments(vehicle: VehicleParameters, path: CarPath, settings: TrackingSetti
     Between two arcs the curvature changes linearly around their joint. The heading change of each arc stays the same,
     so the deviation from the path is a few millimetres. Each segment starts on the planned path.
     """
-    kept = np.abs(path.length) > 1e-9
-    length, curvature = path.length[kept], path.curvature[kept]
+    driven = np.abs(path.length) > 1e-9
+    length, curvature = path.length[driven], path.curvature[driven]
     cuts = np.arange(1, len(length)) if settings.stops else np.flatnonzero(np.diff(np.sign(length))) + 1
     start = tuple(path.start.tolist())
     segments = []
@@ -235,9 +231,8 @@ def _segments(vehicle: VehicleParameters, path: CarPath, settings: TrackingSetti
         station = np.unique(np.r_[station, knots])
         bend = np.interp(station, knots, bends)
         poses = [start]
-        for step, turn in zip(
-            np.diff(station).tolist(), (0.5 * (bend[1:] + bend[:-1])).tolist(), strict=True
-        ):
+        turns = (0.5 * (bend[1:] + bend[:-1])).tolist()
+        for step, turn in zip(np.diff(station).tolist(), turns, strict=True):
             poses.append(move_along(*poses[-1], turn, direction * step))
         fastest = settings.speed if direction > 0.0 else settings.reverse_speed
         rate = _RATE_SHARE * vehicle.steering_rate

@@ -14,8 +14,8 @@ from parkenv.engine.policy import CompiledPolicy, PolicyData
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, PlanPreview, SearchAgent
-from planners.heuristics.policies import TargetPolicy, UsualPolicy
+from planners.agent import Observation, SearchAgent
+from planners.heuristics.policies import POLICIES, target_policy
 from planners.heuristics.rules import (
     FIRST_FREE,
     GREEDY_DRIVE,
@@ -49,10 +49,6 @@ class TargetAgent(SearchAgent[GreedyState]):
     heuristic: ClassVar[int]
     within_m: float | None = None
 
-    def __init__(self, problem: SearchProblem) -> None:
-        super().__init__(problem)
-        self._neighbors = self.problem.lot.neighbors
-
     @cached_property
     def _tables(self) -> PolicyData:
         return heuristic_tables(self.heuristic, [self.problem], self.within_m)
@@ -62,11 +58,9 @@ class TargetAgent(SearchAgent[GreedyState]):
         return {name: value for name, value in vars(self).items() if name != "_tables"}
 
     def begin(self, observation: Observation, belief: SlotBelief) -> GreedyState:
-        del observation, belief
         return GreedyState(np.zeros(2 * self.problem.lot.n_vertices, np.uint8))
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
-        """Keep the target while it is a candidate, else choose another one; park on arrival."""
         states, vertex, target = belief.recent_state, int(observation["vertex"]), memory.target
         if not keeps_target(self.heuristic, target, states[target] if target != NO_SLOT else UNOBSERVED):
             tables = self._tables
@@ -77,7 +71,6 @@ class TargetAgent(SearchAgent[GreedyState]):
         return self._next_action(vertex, memory)
 
     def _next_action(self, vertex: int, memory: GreedyState) -> int:
-        """Go on to the target, or park there; wait where there is none."""
         if memory.target == NO_SLOT:
             return self.wait(vertex)
         if memory.n_moves == 0:
@@ -85,16 +78,16 @@ class TargetAgent(SearchAgent[GreedyState]):
         memory.n_moves -= 1
         return int(memory.moves[memory.n_moves])
 
-    def plan_preview(self, observation: Observation, action: int, memory: GreedyState) -> PlanPreview:
+    def plan_preview(self, observation: Observation, action: int, memory: GreedyState) -> tuple[int, ...]:
         path = [int(observation["vertex"])]
         moves = [] if action == PARK else [action, *memory.moves[: memory.n_moves][::-1]]
         for move in moves:
-            path.append(int(self._neighbors[path[-1], move]))
-        return PlanPreview(tuple(path[1:]))
+            path.append(int(self.problem.lot.neighbors[path[-1], move]))
+        return tuple(path[1:])
 
     def compiled_policy(self) -> CompiledPolicy:
         """Return the policy that decides as this agent for the cars of a fleet, without Python."""
-        return TargetPolicy(self.name, self.heuristic, self.within_m)
+        return target_policy(self.name, self.heuristic, self.within_m)
 
 
 class GreedyGoalAgent(TargetAgent):
@@ -169,7 +162,6 @@ class UsualAgent(TargetAgent):
         return street_tables([self.problem])
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
-        """Keep the target until it is observed taken; park on arrival, or before in a slot that is good enough."""
         states, vertex, target = belief.recent_state, int(observation["vertex"]), memory.target
         tables = self._tables
         tables.arrays["states"][:] = states
@@ -187,7 +179,7 @@ class UsualAgent(TargetAgent):
         return self._next_action(vertex, memory)
 
     def compiled_policy(self) -> CompiledPolicy:
-        return UsualPolicy()
+        return POLICIES[self.name]
 
 
 class RandomAgent(SearchAgent[np.random.Generator]):
@@ -203,11 +195,8 @@ class RandomAgent(SearchAgent[np.random.Generator]):
         self.seed = seed
 
     def begin(self, observation: Observation, belief: SlotBelief) -> np.random.Generator:
-        """Return a generator that depends only on the seed and the time of arrival."""
-        del belief
         moment = int(np.float32(observation["time"][0]).view(np.uint32))
         return np.random.default_rng([self.seed, moment, int(observation["vertex"])])
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: np.random.Generator) -> int:
-        del belief
         return int(memory.choice(np.flatnonzero(observation["action_mask"])))

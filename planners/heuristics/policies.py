@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from parkenv.compiled.memory import uint8_array, uint8s
 from parkenv.engine.policy import (
     LEAVE,
     CompiledPolicy,
-    PolicyData,
     car_of,
     draw_action,
     policy_data,
@@ -21,7 +19,6 @@ from parkenv.engine.policy import (
 )
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import kernel
-from parkenv.world.scenario import SearchProblem
 from planners.heuristics.rules import (
     FIRST_FREE,
     GREEDY_DRIVE,
@@ -41,7 +38,6 @@ _N_ACTIONS = PARK + 1
 
 @kernel
 def decide_by_rule(address: int, number: int) -> int:
-    """Drive to one slot after another by the rule of the policy's tables, and park there if it is free."""
     car = car_of(address, number)
     data, search, target = policy_data(address, car), search_of(car.search), car.target
     tables = tables_at(data, 0)
@@ -68,7 +64,6 @@ def decide_by_rule(address: int, number: int) -> int:
 
 @kernel
 def decide_usual(address: int, number: int) -> int:
-    """Drive to one place after another, and through it, and park in a free slot that is good enough."""
     car = car_of(address, number)
     data, search, target = policy_data(address, car), search_of(car.search), car.target
     time = np.float64(search.clock[1])
@@ -89,47 +84,24 @@ def decide_usual(address: int, number: int) -> int:
     return int(uint8s(search.moves)[car.n_moves])
 
 
-class TargetPolicy(CompiledPolicy):
-    """The compiled policy of a `TargetAgent`: its name, its rule, such as `GREEDY_GOAL`, and `first-free`'s option."""
-
-    def __init__(self, name: str, heuristic: int, within_m: float | None = None) -> None:
-        super().__init__(name, decide_by_rule)
-        self.heuristic, self.within_m = heuristic, within_m
-
-    def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
-        return heuristic_tables(self.heuristic, problems, self.within_m)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return TargetPolicy, (self.name, self.heuristic, self.within_m)
-
-
-class UsualPolicy(CompiledPolicy):
-    """The compiled policy of `UsualAgent`."""
-
-    def __init__(self) -> None:
-        super().__init__("usual", decide_usual)
-
-    def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
-        return street_tables(problems)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return UsualPolicy, ()
+def target_policy(name: str, heuristic: int, within_m: float | None = None) -> CompiledPolicy:
+    """Return the compiled policy of a `TargetAgent` by its rule, such as `GREEDY_GOAL`, and `first-free`'s option."""
+    return CompiledPolicy(name, decide_by_rule, partial(heuristic_tables, heuristic, within_m=within_m))
 
 
 @kernel
 def decide_random(address: int, number: int) -> int:
-    """Choose one of the actions that the graph has, all with equal probability."""
     return int(max(draw_action(search_of(car_of(address, number).search), _N_ACTIONS), 0))
 
 
 POLICIES = {
     policy.name: policy
     for policy in (
-        TargetPolicy("greedy-goal", GREEDY_GOAL),
-        TargetPolicy("greedy-drive", GREEDY_DRIVE),
-        TargetPolicy("greedy-total", GREEDY_TOTAL),
-        TargetPolicy("first-free", FIRST_FREE),
-        UsualPolicy(),
+        target_policy("greedy-goal", GREEDY_GOAL),
+        target_policy("greedy-drive", GREEDY_DRIVE),
+        target_policy("greedy-total", GREEDY_TOTAL),
+        target_policy("first-free", FIRST_FREE),
+        CompiledPolicy("usual", decide_usual, street_tables),
         CompiledPolicy("random", decide_random),
     )
 }

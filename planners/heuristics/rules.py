@@ -23,15 +23,7 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
-from parkenv.compiled.memory import (
-    ADDRESS,
-    float64_array,
-    float64s,
-    int32_array,
-    int32s,
-    record_at,
-    uint8s,
-)
+from parkenv.compiled.memory import ADDRESS, float64_array, float64s, int32_array, int32s, record_at, uint8s
 from parkenv.engine.policy import (
     PolicyData,
     arrival_cost_s,
@@ -136,17 +128,10 @@ def choose_route(
 ) -> tuple[int, int]:
     """Choose the slot to drive to where `keeps_target` is False, and plan a shortest route to it.
 
-    Args:
-        address: address of the TABLES record.
-        place: index of the problem.
-        search: address of the SEARCH record whose tables hold what was observed; 0: those of the heuristic do.
-        vertex: where the car is.
-        target: the target so far, or `NO_SLOT`.
-        moves: (2 n_vertices,) the moves to the target, the last one first; changed in place.
-        n_moves: how many there are.
-
-    Returns:
-        The target, and the number of moves to it; `NO_SLOT` and 0 where the driver may park in no slot in reach.
+    `address` is that of the TABLES record, `place` the index of the problem, `search` the address of the SEARCH record
+    whose tables hold what was observed, or 0 if those of the heuristic do. `moves`, (2 n_vertices,), are those to the
+    target, the last one first, and change in place. Return the target, and the number of moves to it; `NO_SLOT` and 0
+    where the driver may park in no slot in reach.
     """
     tables = tables_at(address, 0)
     chosen = _choose_target(tables, place, search, vertex, target)
@@ -196,7 +181,6 @@ def still_leads(
 
 @inlined_rule
 def state_of(tables: Any, search: int, slot: int) -> int:
-    """Return the recent state of a slot."""
     return int(recent_state(search_of(search), slot) if search else uint8s(tables.states)[slot])
 
 
@@ -315,7 +299,6 @@ def _cheapest(tables: Any, place: int, search: int, vertex: int) -> int:
 
 @rule
 def _search_everywhere(tables: Any, place: int, search: int, vertex: int) -> None:
-    """Compute the drive times from a vertex to all others."""
     _nearest(tables, place, search, vertex, False, -np.inf, BY_DRIVE)
 
 

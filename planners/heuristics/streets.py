@@ -30,15 +30,7 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.heap import pop, push
-from parkenv.compiled.memory import (
-    ADDRESS,
-    float64_array,
-    float64s,
-    int32s,
-    int64s,
-    record_at,
-    uint8s,
-)
+from parkenv.compiled.memory import ADDRESS, float64_array, float64s, int32s, int64s, record_at, uint8s
 from parkenv.engine.policy import (
     PolicyData,
     forecast,
@@ -114,7 +106,6 @@ streets_at = record_at(STREETS)
 
 
 def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
-    """Return the streets of a lot, for the problem of each goal."""
     lot, plain = problems[0].lot, heuristic_tables(GREEDY_DRIVE, problems, None)
     streets = streets_of(lot, np.asarray(problems[0].move_cost_s))
     n_junctions, n_streets = lot.n_vertices - lot.n_slots, len(streets["start"])
@@ -157,7 +148,6 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
 
 
 def streets_of(lot: ParkingLot, move_s: FloatArray) -> dict[str, NDArray[Any]]:
-    """Return the streets of a lot as arrays of `STREETS`."""
     n, neighbors = lot.n_slots, lot.neighbors
     # On from each slot: to a junction, else to the slot that lies in the same direction; not across the street.
     turn = np.cos(lot.vertex_yaw[:n, None] - lot.vertex_yaw[neighbors[:n]])
@@ -354,14 +344,12 @@ def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
 
 @inlined_rule
 def _follows(streets: Any, position: int, slot: int) -> bool:
-    """Return whether a slot is the next one along a street."""
     after, street = position + 1, int32s(streets.street_at)[position]
     return bool(after < int32s(streets.first)[street + 1] and int32s(streets.slots)[after] == slot)
 
 
 @rule
 def _enter(streets: Any, goal: int, search: int, position: int, drive_s: float) -> None:
-    """Begin a search amid a street."""
     street, before_s = np.int64(int32s(streets.street_at)[position]), float64s(streets.along_s)[position]
     _look_along(streets, goal, search, street, position, drive_s - before_s)
     end_s = drive_s - before_s + float64s(streets.length_s)[street]

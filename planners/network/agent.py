@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -13,9 +13,9 @@ from parkenv.belief.slot_belief import OBSERVED_FREE, UNOBSERVED, SlotBelief
 from parkenv.compiled.arrays import FloatArray
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation
-from planners.belief.agent import BeliefAgent, BeliefSearch, Crowd, snapshot
-from planners.belief.planning_graph import MOST_HYPOTHESES, BeliefSnapshot, PlanningGraph
-from planners.neighborhood import MOST_VERTICES, Neighborhood
+from planners.belief.agent import BeliefAgent, BeliefSearch, snapshot
+from planners.belief.planning_graph import MOST_HYPOTHESES, BeliefSnapshot
+from planners.neighborhood import MOST_VERTICES
 from planners.network.features import (
     ACTION_COUNT,
     FAILURE_COSTS,
@@ -38,17 +38,17 @@ HARDLY_ANY = 0.1
 @dataclass
 class NetworkSearch(BeliefSearch):
     previous: int = -1  # the vertex before, in the lot
-    # (n_vertices,) float64, s since the search began, the last visit of each vertex of the part; -1 without one
-    visited_at: FloatArray = field(default_factory=lambda: np.zeros(0))
-    # (n_vertices,) float64, number of visits since something new was observed
-    visits: FloatArray = field(default_factory=lambda: np.zeros(0))
     n_known: int = 0  # slots that were observed at the last decision
-    by_cost: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # slots by arrival cost
-    graph: PlanningGraph | None = None
-    scratch: Scratch | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.near.vertices)
+        # (n_vertices,) float64, s since the search began, the last visit of each vertex of the part; -1 without one
+        self.visited_at = np.full(n, -1.0)
+        self.visits = np.zeros(n)  # number of visits since something new was observed
+        self.by_cost = np.argsort(self.near.cost_s, kind="stable")  # slots by arrival cost
+        self.scratch = Scratch.of(self.near.n_slots, MOST_HYPOTHESES)
 
     def copy(self) -> Self:
-        """Return a copy that may be moved on without this one; the buffers are shared."""
         other = super().copy()
         other.visited_at, other.visits = self.visited_at.copy(), self.visits.copy()
         return other
@@ -82,6 +82,7 @@ class NetworkAgent(BeliefAgent):
     """
 
     name: ClassVar[str] = "network"
+    memory: ClassVar = NetworkSearch
 
     def __init__(
         self,
@@ -98,18 +99,6 @@ class NetworkAgent(BeliefAgent):
         # Copies: the lot's arrays are read-only, for which numba would compile every function again.
         self._neighbors, self._move_s = self.problem.lot.neighbors.copy(), self.problem.move_cost_s.copy()
 
-    def _search_of(self, near: Neighborhood, belief: SlotBelief, crowd: Crowd) -> NetworkSearch:
-        base = super()._search_of(near, belief, crowd)
-        n = len(near.vertices)
-        return NetworkSearch(
-            **vars(base),
-            visited_at=np.full(n, -1.0),
-            visits=np.zeros(n),
-            by_cost=np.argsort(near.cost_s, kind="stable"),
-            graph=near.planning_graph(self.problem, self.failure_s),
-            scratch=Scratch.of(near.n_slots, MOST_HYPOTHESES),
-        )
-
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
         self.last_features = self.last_scores = None
         return super().decide(observation, belief, memory)
@@ -117,7 +106,6 @@ class NetworkAgent(BeliefAgent):
     def _follow_best_path(
         self, vertex: int, here: int, known: SlotBelief, memory: BeliefSearch
     ) -> int | None:
-        """Return the action with the best score; that of `belief` where hardly a free slot is left to be found."""
         assert isinstance(memory, NetworkSearch)
         belief, state = snapshot(here, known, memory), memory.state
         unobserved = belief.slots["p_free"][state == UNOBSERVED]
@@ -137,8 +125,6 @@ class NetworkAgent(BeliefAgent):
     ) -> Features:
         """Return the network's observation; the next call overwrites it."""
         near, out = memory.near, self._features
-        assert memory.graph is not None
-        assert memory.scratch is not None
         following = np.array(
             [near.index(end) if end >= 0 else -1 for end in self._neighbors[vertex].tolist()]
         )
@@ -155,8 +141,8 @@ class NetworkAgent(BeliefAgent):
             known.forecast.astype(np.float64),
             known.observed_at.astype(np.float64),
         )
-        nothing = np.empty(0, np.int64)
-        decision = Decision(memory.by_cost, nothing, np.inf, memory.graph, belief, memory.scratch)
+        graph, nothing = self._planning_graph(memory), np.empty(0, np.int64)
+        decision = Decision(memory.by_cost, nothing, np.inf, graph, belief, memory.scratch)
         observe(now, self._failure_costs, decision, out)
         return out
 

@@ -23,15 +23,11 @@ from planners.belief.path import expected_cost_to_slot, options_at_hand
 from planners.belief.planning_graph import BeliefSnapshot, PlanningGraph, is_hidden, needs_attempt
 from planners.network.lookahead import Decision, best_option, next_target, path_value
 
-ACTION_COUNT = 6
-"""Four moves, parking, waiting."""
+ACTION_COUNT = 6  # four moves, parking, waiting
 PARKING, WAITING = 4, 5
-FAILURE_COSTS = (1.0, 4.0, 16.0)
-"""s, failure costs of the thesis's planner on the paths of the look-ahead."""
-CANDIDATES = 8
-"""Number of slots that are tokens."""
-MOST_OPTIONS = 4
-"""Number of slots known to be free that the look-ahead considers."""
+FAILURE_COSTS = (1.0, 4.0, 16.0)  # s, failure costs of the thesis's planner on the paths of the look-ahead
+CANDIDATES = 8  # number of slots that are tokens
+MOST_OPTIONS = 4  # number of slots known to be free that the look-ahead considers
 LEAST_SCALE = 1e-3  # s, lower bound of the time scale
 MOST_REGRET = 4.0  # largest difference between times, in time scales
 

@@ -6,9 +6,10 @@ The file is a model file (see `planners.model_file`); it is read without PyTorch
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,12 +65,16 @@ class NetworkCard(Spec):
             f"{name}.bias": shape[1:] for name, shape in layers.items()
         }
 
+    def layout(self) -> dict[str, dict[str, Any]]:
+        """Return the header of the weights, one behind the other."""
+        entries, end = {}, 0
+        for name, shape in self.shapes().items():
+            begin, end = end, end + 4 * math.prod(shape)
+            entries[name] = {"dtype": "F32", "shape": list(shape), "data_offsets": [begin, end]}
+        return entries
 
-class Layer(NamedTuple):
-    """A linear layer."""
 
-    weight: Float32Array  # (n_inputs, n_outputs) float32
-    bias: Float32Array  # (n_outputs,) float32
+Layer = tuple[Float32Array, Float32Array]  # weights, (n_inputs, n_outputs), and biases, (n_outputs,)
 
 
 class NetworkPolicy(NamedTuple):
@@ -86,14 +91,18 @@ class NetworkPolicy(NamedTuple):
             InputError: the file is missing or damaged, or holds another network.
         """
         data = read_bytes(Path(path), _MAX_BYTES)
-        header = read_header(data, path)
-        if header.card.get("format") != FORMAT:
+        content, tensors, body = read_header(data, path)
+        if content.get("format") != FORMAT:
             raise InputError(f"{path}: has no card of a network; want a file of weights of `network`")
-        card = NetworkCard.parse(header.card, f"{path}: card")
+        card = NetworkCard.parse(content, f"{path}: card")
+        layout = card.layout()
+        if tensors != layout or len(body) < max(e["data_offsets"][1] for e in layout.values()):
+            raise InputError(
+                f"{path}: has not the weights of its card, {card.token_width} and {card.width} wide"
+            )
         weights = {}
-        for name, shape in card.shapes().items():
-            begin, end = _offsets(header.tensors.get(name), name, shape, len(header.body), path)
-            values = np.frombuffer(header.body[begin:end], "<f4").reshape(shape)
+        for name, entry in layout.items():
+            values = np.frombuffer(body[slice(*entry["data_offsets"])], "<f4").reshape(entry["shape"])
             if not (np.abs(values) <= _MAX_WEIGHT).all():
                 raise InputError(f"{path}: {name} has weights that are no numbers, or above {_MAX_WEIGHT:g}")
             weights[name] = values.astype(np.float32)
@@ -101,15 +110,11 @@ class NetworkPolicy(NamedTuple):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file, atomically."""
-        header: dict[str, object] = {"__metadata__": {CARD_KEY: self.card.model_dump_json()}}
-        at = 0
-        for name, values in self.weights.items():
-            header[name] = {"dtype": "F32", "shape": values.shape, "data_offsets": [at, at + values.nbytes]}
-            at += values.nbytes
-        text = json.dumps(header).encode()
+        layout = self.card.layout()
+        text = json.dumps({"__metadata__": {CARD_KEY: self.card.model_dump_json()}, **layout}).encode()
         text += b" " * (-len(text) % 8)
         with atomic_write(path) as beside:
-            body = b"".join(np.ascontiguousarray(v, "<f4").tobytes() for v in self.weights.values())
+            body = b"".join(np.ascontiguousarray(self.weights[name], "<f4").tobytes() for name in layout)
             beside.write_bytes(len(text).to_bytes(8, "little") + text + body)
 
     def scores(self, features: Features) -> Float32Array:
@@ -125,7 +130,7 @@ class NetworkPolicy(NamedTuple):
             own.reshape(-1, *own.shape[-2:]),
             tokens.reshape(-1, *tokens.shape[-3:]),
             features.allowed.reshape(-1, ACTION_COUNT),
-            tuple(Layer(self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]) for name in LAYERS),
+            tuple((self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]) for name in LAYERS),
             scores,
         )
         return scores.reshape(shape)
@@ -161,7 +166,7 @@ def _score(
 ) -> None:
     """Write the scores, (n, 6), of n decisions: outputs of the network minus the look-ahead's regret."""
     token_1, token_2, attention, action_1, action_2, score_1, score_2 = layers
-    n_own, t, w = actions.shape[2], len(token_1.bias), len(action_1.bias)
+    n_own, t, w = actions.shape[2], len(token_1[1]), len(action_1[1])
     hidden = np.empty((CANDIDATES, t), np.float32)
     weight, between = np.empty(CANDIDATES, np.float32), np.empty(max(t, w), np.float32)
     seen, of_action = np.empty(n_own + 2 * t, np.float32), np.empty((ACTION_COUNT, w), np.float32)
@@ -200,16 +205,3 @@ def _score(
                 _rectified(of_all, score_1, between[:w])
                 _linear(between[:w], score_2, scores[i, a : a + 1])
                 scores[i, a] -= actions[i, a, LOOKAHEAD]
-
-
-def _offsets(
-    entry: object, name: str, shape: tuple[int, ...], size: int, path: str | os.PathLike[str]
-) -> tuple[int, int]:
-    """Return where the bytes of a weight begin and end."""
-    if isinstance(entry, dict) and entry.get("dtype") == "F32" and entry.get("shape") == list(shape):
-        offsets = entry.get("data_offsets")
-        if isinstance(offsets, list) and len(offsets) == 2 and all(type(o) is int for o in offsets):
-            begin, end = offsets
-            if begin >= 0 and end == begin + 4 * int(np.prod(shape)) and end <= size:
-                return begin, end
-    raise InputError(f"{path}: has no weights {name!r} of shape {shape}, float32")

@@ -20,11 +20,16 @@ It terminates if all edges are two-way, since h includes the cost of shuttling, 
 directed cycle is cheaper than every stop. Otherwise labels would fall for ever. A limit on the work then stops the
 pass: it is repeated with a heap, whose order does not depend on climbs, and if that fails policy iteration takes over.
 At γ = 1 it is Dijkstra's algorithm with a virtual source; plans that never end cost infinity.
+
+**Repair** after some probabilities have changed, instead of planning from scratch (Ramalingam and Reps 1996): a change
+can increase only the labels of the tree of vertices that were labelled from the changed stop. These get the best label
+that their other neighbours offer; labels then spread only from there and from stops that improved. Most observations
+affect a handful of vertices, whatever the size of the lot. If a change reaches more than a fixed part of the lot,
+planning from scratch is faster and is done instead.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -42,6 +47,9 @@ STOP = PARK  # the move of a vertex at which to stay: to park, or because nothin
 TIE_S = 1e-7  # s: actions whose values differ by less are equally good; solvers agree to well within it
 _BUCKETS_PER_VERTEX = 2  # maximum number of buckets per vertex, so that skipping empty ones costs little
 _NEVER = np.iinfo(np.int64).max
+REACH = 0.1  # fraction of the lot's vertices that a repair may change; above it the plan is made from scratch
+_LEAST_REACH = 64
+_AFFECTED = STOP + 1
 _REFILLS = 64  # maximum number of refills of all buckets; beyond it a heap is faster
 
 
@@ -64,7 +72,6 @@ class StoppingGraph(NamedTuple):
 
     @classmethod
     def of(cls, mdp: ParkingMDP) -> StoppingGraph:
-        """Make the graph of a decision process, without its probabilities."""
         # Copies: numba would compile every function again for read-only arrays.
         neighbors, move_s = mdp.neighbors.astype(np.int32), np.array(mdp.move_s, order="C")
         start, source, move, seconds = edges_in(neighbors, move_s)
@@ -76,7 +83,7 @@ class StoppingGraph(NamedTuple):
 
 @dataclass
 class Labels:
-    """A plan: cost and action of each vertex. `label_repair.repair` changes it in place."""
+    """A plan: cost and action of each vertex. `repair` changes it in place."""
 
     cost: FloatArray  # (n,) float64, s, -V of each vertex
     move: NDArray[np.int8]  # (n,) int8, the move that gave the label, or `STOP`
@@ -101,17 +108,13 @@ def label_setting(mdp: ParkingMDP) -> Solution:
 
 
 def set_labels(graph: StoppingGraph, p_free: FloatArray) -> Labels:
-    """Plan by one pass of label setting; `p_free`, (n,), is kept, not copied.
-
-    If the plan is not `settled`, circling pays somewhere, and the costs are only upper bounds.
-    """
+    """Plan by one pass of label setting; `p_free`, (n,), is not copied. If not `settled`, costs are upper bounds."""
     labels = Labels(np.empty(len(p_free)), np.empty(len(p_free), dtype=np.int8), p_free, settled=False)
     update_labels(graph, labels)
     return labels
 
 
 def update_labels(graph: StoppingGraph, labels: Labels) -> None:
-    """Update a plan in place to its current probabilities by one pass of label setting."""
     width = float(graph.in_s.min()) if len(graph.in_s) else 1.0
     labels.settled = bool(
         _set_by_buckets(graph, labels.p_free, width, labels.cost, labels.move)
@@ -120,16 +123,11 @@ def update_labels(graph: StoppingGraph, labels: Labels) -> None:
 
 
 def by_policy_iteration(mdp: ParkingMDP, start: Labels | None = None) -> tuple[Labels, int]:
-    """Plan by the thesis's solver, starting from the moves of another plan; return the plan and the iterations."""
+    """Plan by the thesis's solver from the moves of another plan; return the plan and the iterations."""
     policy = None if start is None else start.move.astype(np.int64)
     solution = policy_iteration(mdp, policy)
     labels = Labels(-solution.values, solution.policy.astype(np.int8), mdp.p_free, settled=False)
     return labels, solution.iterations
-
-
-def with_p_free(mdp: ParkingMDP, p_free: FloatArray) -> ParkingMDP:
-    """Return the process with other probabilities, (n,)."""
-    return dataclasses.replace(mdp, p_free=p_free)
 
 
 @compiled(error_model="numpy")
@@ -181,7 +179,6 @@ def best_move(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, vertex
 
 @compiled(error_model="numpy")
 def best_moves(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray) -> NDArray[np.int64]:
-    """Return `best_move` of every vertex, (n,) int64."""
     moves = np.empty(len(cost), dtype=np.int64)
     for u in range(len(cost)):
         moves[u] = best_move(graph, p_free, cost, u)
@@ -330,6 +327,73 @@ def spread(
                 cost[u], move[u] = label, graph.in_move[e]
                 size = push(keys, vertices, size, label, u)
     return n_entered
+
+
+def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_free: FloatArray) -> int:
+    """Update a plan in place after some slots, (k,), got other probabilities, (k,), as if it were made from scratch.
+
+    Return the number of labels set; -1 if it was planned from scratch. `labels.settled` is as after `set_labels`.
+    """
+    labels.p_free[vertices] = p_free
+    reach = max(_LEAST_REACH, int(REACH * len(labels.cost)))
+    touched = -1
+    if labels.settled and len(vertices) <= reach:
+        touched = _repair(graph, vertices, labels.p_free, labels.cost, labels.move, reach)
+    if touched < 0:
+        update_labels(graph, labels)
+    return touched
+
+
+@compiled(error_model="numpy")
+def _repair(
+    graph: StoppingGraph,
+    vertices: NDArray[np.int64],
+    p_free: FloatArray,
+    cost: FloatArray,
+    move: NDArray[np.int8],
+    reach: int,
+) -> int:
+    """Return the number of labels set; -1, with unusable labels, if more than `reach` vertices are affected."""
+    affected, n_affected = np.empty(reach, dtype=np.int32), 0
+    keys, queued, size = np.empty(2 * reach), np.empty(2 * reach, dtype=np.int32), 0
+    for i in range(len(vertices)):
+        s = vertices[i]
+        if move[s] == STOP and stop_cost(graph, p_free, s) > cost[s]:
+            affected[n_affected], move[s] = s, _AFFECTED
+            n_affected += 1
+    tail = 0
+    while tail < n_affected:
+        v = affected[tail]
+        tail += 1
+        for e in range(graph.in_start[v], graph.in_start[v + 1]):
+            u = graph.in_source[e]
+            if move[u] == graph.in_move[e]:
+                if n_affected == reach:
+                    return -1
+                affected[n_affected], move[u] = u, _AFFECTED
+                n_affected += 1
+    for i in range(n_affected):
+        u = affected[i]
+        cost[u], best = stop_cost(graph, p_free, u), STOP
+        for a in range(graph.neighbors.shape[1]):
+            v = graph.neighbors[u, a]
+            if v >= 0 and move[v] != _AFFECTED:
+                label = graph.move_s[u, a] + graph.gamma * cost[v]
+                if label < cost[u]:
+                    cost[u], best = label, a
+        move[u] = best
+        if cost[u] < np.inf:
+            size = push(keys, queued, size, cost[u], u)
+    n_set = n_affected
+    for i in range(len(vertices)):
+        s = vertices[i]
+        own = stop_cost(graph, p_free, s)
+        if own < cost[s]:
+            cost[s], move[s] = own, STOP
+            size = push(keys, queued, size, own, s)
+            n_set += 1
+    n_spread = spread(graph, cost, move, keys, queued, size)
+    return n_set + n_spread if n_spread >= 0 else -1
 
 
 @compiled

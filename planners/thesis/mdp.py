@@ -13,10 +13,8 @@ from parkenv.errors import InputError, require_number
 from parkenv.world.lot import ACTIONS, MOVES, PARK
 from parkenv.world.scenario import SearchProblem
 
-USUAL_DISCOUNT = 0.9999
-"""The thesis's discount per decision."""
-SHORTEST_S = 1e-4
-"""Drive time, s, that shorter edges count as in `discount`."""
+USUAL_DISCOUNT = 0.9999  # the thesis's discount per decision
+SHORTEST_S = 1e-4  # drive time, s, that shorter edges count as in `discount`
 
 
 class CirclingWarning(UserWarning):
@@ -103,8 +101,7 @@ class ParkingMDP:
             raise InputError("arrival_cost_s must be finite and move_s not negative")
         for name in ("failure_s", "wait_s"):
             require_number(name, getattr(self, name), least=0.0)
-        if not 0.0 < self.gamma <= 1.0:
-            raise InputError(f"gamma is {self.gamma}, want a number in (0, 1]")
+        require_number("gamma", self.gamma, above=0.0, most=1.0)
         object.__setattr__(self, "park_reward", arrival_cost_s.max() - arrival_cost_s)
 
     @classmethod

@@ -43,7 +43,7 @@ def policy_iteration(
     """
     if mdp.gamma >= 1.0:
         raise InputError(
-            "policy iteration needs gamma below 1: a policy that never parks has no finite value"
+            "policy iteration needs gamma below 1: else a policy that never parks has no finite value"
         )
     n = mdp.n_states
     state = np.arange(n)
@@ -52,13 +52,9 @@ def policy_iteration(
     if policy.shape != (n,):
         raise InputError(f"policy has shape {policy.shape}, want ({n},)")
     for iteration in range(1, max_iterations + 1):
-        system = csc_array(
-            (
-                np.concatenate([np.ones(n), -continuation[state, policy]]),
-                (np.concatenate([state, state]), np.concatenate([state, successors[state, policy]])),
-            ),
-            shape=(n, n),
-        )
+        weights = np.concatenate([np.ones(n), -continuation[state, policy]])
+        entries = np.concatenate([state, state]), np.concatenate([state, successors[state, policy]])
+        system = csc_array((weights, entries), shape=(n, n))
         values = splu(system).solve(rewards[state, policy])
         q = rewards + continuation * values[successors]
         current, best = q[state, policy], q.max(axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -11,20 +11,19 @@ from numpy.typing import NDArray
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_one_of
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import nearness
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, PlanPreview, SearchAgent
-from planners.thesis.label_repair import repair
+from planners.agent import Observation, SearchAgent
 from planners.thesis.label_setting import (
     Labels,
     StoppingGraph,
     best_move,
     best_moves,
     by_policy_iteration,
+    repair,
     set_labels,
-    with_p_free,
 )
 from planners.thesis.mdp import ParkingMDP
 
@@ -74,8 +73,7 @@ class StaticAgent(SearchAgent[Plan]):
         solver: str = "label_setting",
     ) -> None:
         super().__init__(problem)
-        if solver not in SOLVERS:
-            raise InputError(f"solver is {solver!r}, want one of {', '.join(SOLVERS)}")
+        require_one_of("solver", solver, SOLVERS)
         if solver == "policy_iteration" and gamma == 1.0:
             raise InputError(f"gamma is {gamma}, want below 1 for the solver policy_iteration")
         self.failure_s = problem.failure_s if failure_s is None else failure_s
@@ -89,15 +87,10 @@ class StaticAgent(SearchAgent[Plan]):
 
     def solve(self, p_occupied: NDArray[np.floating]) -> Labels:
         """Make the optimal plan for a belief, (n_slots,) P(taken)."""
-        n_slots = self.problem.lot.n_slots
-        if p_occupied.shape != (n_slots,):
-            raise InputError(f"p_occupied has shape {p_occupied.shape}, want ({n_slots},)")
         p_free = np.zeros(self._mdp.n_states)
-        np.subtract(1.0, p_occupied, out=p_free[:n_slots], dtype=np.float64)
-        if not (p_free.min() >= 0.0 and p_free.max() <= 1.0):
-            raise InputError("p_occupied must lie in [0, 1]")
+        np.subtract(1.0, p_occupied, out=p_free[: len(p_occupied)], dtype=np.float64)
         if self.solver == "policy_iteration":
-            labels, _ = by_policy_iteration(with_p_free(self._mdp, p_free))
+            labels, _ = by_policy_iteration(replace(self._mdp, p_free=p_free))
         else:
             labels = self._solved(set_labels(self._graph, p_free))
         self._check_discount(labels, float(labels.cost.max()))
@@ -108,15 +101,13 @@ class StaticAgent(SearchAgent[Plan]):
         return self._mdp.expected_time(-self.solve(p_occupied).cost)
 
     def begin(self, observation: Observation, belief: SlotBelief) -> Plan:
-        del observation
         return Plan(self._graph, self.solve(belief.p_occupied))
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: Plan) -> int:
-        del belief
         labels = memory.labels
         return int(best_move(self._graph, labels.p_free, labels.cost, int(observation["vertex"])))
 
-    def plan_preview(self, observation: Observation, action: int, memory: Plan) -> PlanPreview:
+    def plan_preview(self, observation: Observation, action: int, memory: Plan) -> tuple[int, ...]:
         labels, vertex = memory.labels, int(observation["vertex"])
         path: list[int] = []
         while len(path) < MOST_HOPS and action != PARK:
@@ -125,18 +116,17 @@ class StaticAgent(SearchAgent[Plan]):
                 break
             path.append(vertex)
             action = best_move(self._graph, labels.p_free, labels.cost, vertex)
-        return PlanPreview(tuple(path))
+        return tuple(path)
 
     def _solved(self, labels: Labels) -> Labels:
         """Return the plan; solve it by policy iteration if label setting did not terminate because circling pays."""
         if labels.settled:
             return labels
-        return by_policy_iteration(with_p_free(self._mdp, labels.p_free), labels)[0]
+        return by_policy_iteration(replace(self._mdp, p_free=labels.p_free), labels)[0]
 
     def _check_discount(self, labels: Labels, cost_s: float) -> None:
-        """Warn where a cost is so high that circling can look better than parking."""
         if cost_s >= self._suspect_s:
-            with_p_free(self._mdp, labels.p_free).check_discount(-labels.cost)
+            replace(self._mdp, p_free=labels.p_free).check_discount(-labels.cost)
 
 
 class ReplanningAgent(StaticAgent):
@@ -177,7 +167,6 @@ class ReplanningAgent(StaticAgent):
         return plan
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: Plan) -> int:
-        """Repair the plan if the belief has changed; then follow it."""
         labels, p_occupied = memory.labels, belief.p_occupied
         if memory.day is not None:
             memory.day.update(belief.observations)
@@ -186,7 +175,7 @@ class ReplanningAgent(StaticAgent):
         if len(slots):
             if self.solver == "policy_iteration":
                 labels.p_free[slots] = p_free
-                labels, _ = by_policy_iteration(with_p_free(self._mdp, labels.p_free), labels)
+                labels, _ = by_policy_iteration(replace(self._mdp, p_free=labels.p_free), labels)
             else:
                 repair(self._graph, labels, slots, p_free)
                 labels = self._solved(labels)
@@ -206,8 +195,7 @@ def _changed_slots(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the slots whose probability differs from the plan, and their P(free), if any is relevant; else none.
 
-    An observation that makes a slot certain is always relevant, however small the change: otherwise the agent would
-    keep attempting a nearly hopeless slot that it has found taken.
+    What makes a slot certain is always relevant: else the agent would keep attempting one that it has found taken.
     """
     n = len(p_occupied)
     blocks, n_blocks, n_changed = np.empty(n // _BLOCK + 1, dtype=np.int64), 0, 0

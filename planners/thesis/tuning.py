@@ -24,7 +24,7 @@ from parkenv.errors import InputError, require_whole
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
+from planners.agent import Observation, SearchAgent, require_observations
 from planners.belief.planning_graph import PlanningGraph
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
@@ -126,12 +126,7 @@ def _mean_times(
 
 @compiled
 def _total_time(
-    vertex: int,
-    taken: NDArray[np.bool_],
-    key: np.uint64,
-    cost: float,
-    graph: PlanningGraph,
-    odds: FloatArray,
+    vertex: int, taken: NDArray[np.bool_], key: np.uint64, cost: float, graph: PlanningGraph, odds: FloatArray
 ) -> float:
     """Return the total time, s, of the thesis's planner in one world; its belief `odds`, P(taken)/P(free), changes."""
     total, n_taken = 0.0, 0
@@ -172,10 +167,7 @@ def _total_time(
 
 @compiled
 def _best_target(vertex: int, cost: float, graph: PlanningGraph, odds: FloatArray) -> tuple[int, float]:
-    """Return the slot that the thesis's planner drives to, and its expected time, s.
-
-    With γ = 1 its plan is to drive to one slot and attempt it until it is free: drive + arrival cost + cost·(1 - p)/p.
-    """
+    """Return the slot that the thesis's planner drives to, and its expected time, s, as in `planners.belief.path`."""
     best, chosen = np.inf, -1
     drive_s = graph.drive_s[vertex]
     for s in range(len(odds)):
@@ -195,12 +187,10 @@ class TunedPlan:
 
     @property
     def replans(self) -> int:
-        """Number of times that the agent has replanned in this episode."""
         return self.plan.replans
 
     @property
     def policy(self) -> NDArray[np.int64]:
-        """The action for each vertex, (n_vertices,) int64."""
         return self.plan.policy
 
 
@@ -261,7 +251,6 @@ class TunedAgent(SearchAgent[TunedPlan]):
         return TunedPlan(best, entry, self._planners[best].begin(observation, belief))
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: TunedPlan) -> int:
-        """Drive to the entry, then decide as the thesis's planner at the chosen cost."""
         vertex = int(observation["vertex"])
         if vertex == memory.entry:
             memory.entry = -1
@@ -269,7 +258,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
             return self._routes.move_toward(vertex, memory.entry)
         return self._planners[memory.failure_s].decide(observation, belief, memory.plan)
 
-    def plan_preview(self, observation: Observation, action: int, memory: TunedPlan) -> PlanPreview:
+    def plan_preview(self, observation: Observation, action: int, memory: TunedPlan) -> tuple[int, ...]:
         if memory.entry >= 0:
-            return PlanPreview(self._routes.path(int(observation["vertex"]), memory.entry))
+            return self._routes.path(int(observation["vertex"]), memory.entry)
         return self._planners[memory.failure_s].plan_preview(observation, action, memory.plan)

@@ -11,8 +11,7 @@ import shapely
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.collision_world import ObstacleKind
-from parkenv.driving.drive_state import DriveState
-from parkenv.driving.parking_task import REACH, ParkingTask
+from parkenv.driving.parking_task import REACH, DriveState, ParkingTask
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, placed
 from parkenv.show.colors import FREE, mixed_color
 from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, painted_finely, strip, write_line

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.network import NetworkPolicy
+from parkenv.engine.network import compiled_network
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
@@ -67,7 +67,7 @@ def policy_of(
     return None, AgentsByStay(spec, scenario, known)
 
 
-def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "network") -> NetworkPolicy:
+def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "network") -> CompiledPolicy:
     """Return a policy of stable-baselines3 or sb3-contrib, for `local` observations of k slots, as a compiled driver.
 
     It draws its actions if `sampled`, instead of taking the most probable one.
@@ -89,7 +89,7 @@ def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "n
         )
     layers = [(part.weight.detach().cpu().numpy(), part.bias.detach().cpu().numpy()) for part in linear]
     activation, masked = others.pop() if others else "tanh", type(policy).__name__.startswith("Maskable")
-    return NetworkPolicy(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
+    return compiled_network(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
 
 
 def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:

@@ -12,10 +12,9 @@ from pydantic import Field
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
-from parkenv.driving.lot_obstacles import REACH_M, LotObstacles
-from parkenv.driving.road_users import RoadUsers
+from parkenv.driving.drivable_area import REACH_M, LotObstacles
+from parkenv.driving.road_users import RoadUsers, YieldingTraffic
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
-from parkenv.driving.yielding_traffic import YieldingTraffic
 from parkenv.envs.drive import CONTROL_S, SUBSTEPS
 from parkenv.files.field_types import Number, Positive, Validated
 from parkenv.world.occupancy.process import World

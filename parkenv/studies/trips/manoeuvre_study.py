@@ -114,15 +114,6 @@ class ManoeuvreStudy(Study):
     )
     episodes: int = option(100, "Episodes per lot, or scenes per level.", short="-n", ge=1, le=1_000_000)
     vehicle: Vehicle = None
-    shorten_s: float = option(
-        0.0,
-        "Wall time, s, to shorten each drive of a scene by optimal control (extra optimal).",
-        name="--shorten",
-        takes="S",
-        panel="Scenes",
-        ge=0.0,
-        le=3_600.0,
-    )
     seed: Seed = Field(0, description="First seed; episode or scene i uses seed + i.")
     figures: Figures = True
 
@@ -150,10 +141,6 @@ class ManoeuvreStudy(Study):
             (self.cases is None) != (self.levels is None),
             "cases and levels exclude each other: want one of them",
         )
-        if self.shorten_s > 0.0:
-            from planners.driving.time_optimal import require_casadi
-
-            require_casadi()
         for name in self.sources if self.cases else (f"{level}-{self.seed}" for level in self.levels or ()):
             self.scene(name)
 
@@ -169,13 +156,9 @@ class ManoeuvreStudy(Study):
 
     def run(self, work: Labelled, items: Sequence[str]) -> list[Row]:
         from planners.driving.manoeuvre import park
-        from planners.driving.time_optimal import shorten
 
         _warm()
-        manoeuvres = {name: park(self.scene(name)) for name in items}
-        if self.shorten_s > 0.0:
-            manoeuvres = {name: shorten(each, self.shorten_s) for name, each in manoeuvres.items()}
-        return [manoeuvre_row(work.columns | {"case": name}, each) for name, each in manoeuvres.items()]
+        return [manoeuvre_row(work.columns | {"case": name}, park(self.scene(name))) for name in items]
 
     def summarise(self, results: Results) -> Row:
         names = (*MANOEUVRES.keys, *MANOEUVRES.columns)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 import gymnasium as gym
 import numpy as np
 
-from parkenv.driving.drive_state import DriveState
+from parkenv.driving.parking_task import DriveState
 from parkenv.driving.vehicle import STEERING, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
 from parkenv.files.csv_tables import write_csv

@@ -1,26 +1,30 @@
-"""Time-optimal driving: shorten a driven manoeuvre by optimal control in a corridor free of obstacles (needs CasADi).
+"""Time-optimal driving: shorten driven manoeuvres by optimal control in a corridor free of obstacles.
+
+    pip install 'casadi>=3.6.5'
+    python examples/shorten_drives.py
 
 After Li, Acarman, Peng, Zhang, Bian and Kong, "Maneuver planning for automatic parking with safe travel corridors"
 (European Control Conference, 2020): every pose has a box around the car that is free of obstacles, and its corners stay
-inside. The corridor follows each solution, so that more time gives shorter drives; each is driven and judged again.
+inside. The corridor follows each solution, so that more time gives shorter drives; each is driven and judged again, and
+a shorter one counts only if it passes the same check.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import math
 import time
-from importlib import import_module
 from typing import Any, NamedTuple
 
+import casadi
 import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.driving.levels import level_scene
 from parkenv.driving.scene import Scene
-from parkenv.driving.vehicle import PHYSICS_S, SPEED, VehicleParameters, advance, placed
-from parkenv.errors import with_extra
-from planners.driving.manoeuvre import Manoeuvre
+from parkenv.driving.vehicle import PHYSICS_S, SPEED, TPCAP, VehicleParameters, advance, placed
+from planners.driving.manoeuvre import Manoeuvre, park
+
+SCENES, DEADLINE_S = 10, 3.0  # wall time for each
 
 _SPEED, _ACCELERATION, _INTERVAL_S = 1.5, 0.7, 0.25  # m/s, m/s², s, of the first reference
 _LEAST_KNOTS = 6  # of a phase, from one change of direction to the next
@@ -47,37 +51,37 @@ class Reference(NamedTuple):
         return sum(dt * (len(states) - 1) for states, dt in zip(*self, strict=True))
 
 
-def shorten(made: Manoeuvre, deadline_s: float) -> Manoeuvre:
+def shorten(drive: Manoeuvre, deadline_s: float) -> Manoeuvre:
     """Return the shortest drive found until a deadline, s: one that touches nothing and arrives, or the given one.
 
     A drive among road users stays as it is: it has waited for them.
     """
     until = time.perf_counter() + deadline_s
-    if made.path is None or made.others is not None or not made.judged.driven:
-        return made
-    room_m = made.judged.clearance_m
-    best, least_m = made, min(room_m, _LEAST_CLEAR_M)
+    if drive.path is None or drive.others is not None or not drive.judged.driven:
+        return drive
+    room_m = drive.judged.clearance_m
+    best, least_m = drive, min(room_m, _LEAST_CLEAR_M)
     for clear_m, share in _CLEAR:
-        reference = _first(made)
+        reference = _first(drive)
         while (left := until - time.perf_counter()) > 0.0:
-            found = _solve(made.scene, reference, min(clear_m, share * room_m), left)
-            if found is None:
+            solution = _solve(drive.scene, reference, min(clear_m, share * room_m), left)
+            if solution is None:
                 break
-            driven = dataclasses.replace(made, states=follow(made.scene.vehicle, found, made.states[0]))
+            driven = dataclasses.replace(drive, states=follow(drive.scene.vehicle, solution, drive.states[0]))
             judged = driven.judged
             if judged.driven and judged.clearance_m >= least_m and driven.time_s < best.time_s:
                 best = driven
-            saved, reference = reference.time_s - found.time_s, found
+            saved, reference = reference.time_s - solution.time_s, solution
             if saved < _BETTER_S:
                 break
-        if best is not made:
+        if best is not drive:
             break
     return best
 
 
-def _first(made: Manoeuvre) -> Reference:
+def _first(drive: Manoeuvre) -> Reference:
     """Return the planned path as a reference at a moderate speed."""
-    path = made.path
+    path = drive.path
     assert path is not None
     poses, curvature, direction = path.sampled(0.02)
     cuts = np.flatnonzero(np.diff(direction)) + 1
@@ -93,7 +97,7 @@ def _first(made: Manoeuvre) -> Reference:
         pace = _ACCELERATION * np.minimum(np.minimum(t, whole - t), ramp)
         way = np.r_[0.0, np.cumsum(0.5 * (pace[1:] + pace[:-1]))]
         at = part[np.round(way / way[-1] * (len(part) - 1)).astype(int)]
-        wheels = np.arctan(curvature[at] * made.scene.vehicle.wheelbase)
+        wheels = np.arctan(curvature[at] * drive.scene.vehicle.wheelbase)
         states.append(np.column_stack([poses[at], direction[part[-1]] * pace, wheels]))
         interval.append(whole / n)
     return Reference(states, interval)
@@ -122,7 +126,7 @@ def _boxes(scene: Scene, poses: FloatArray, clear_m: float) -> FloatArray:
 
 def _solve(scene: Scene, reference: Reference, clear_m: float, seconds: float) -> Reference | None:
     """Solve for the shortest time in the corridor around a reference; None if that fails or takes too long."""
-    casadi, car = require_casadi(), scene.vehicle
+    car = scene.vehicle
     corners = car.corners(np.zeros(3))
     (rear, right), (front, left) = corners.min(axis=0), corners.max(axis=0)
     hardest, quickest = _SHARE * min(car.max_acceleration, car.max_braking), _SHARE * car.steering_rate
@@ -151,7 +155,7 @@ def _solve(scene: Scene, reference: Reference, clear_m: float, seconds: float) -
         ):  # fmt: skip
             problem.subject_to(problem.bounded(low, value, high))
         problem.subject_to(x[:, 0] == last)
-        problem.subject_to(x[:, 1:] == _advanced(casadi, x[:, :-1], u, dt, car.wheelbase))
+        problem.subject_to(x[:, 1:] == _advanced(x[:, :-1], u, dt, car.wheelbase))
         problem.subject_to(x[3, n] == 0.0)
         last = x[:, n]
         cost += n * dt + _SMOOTH * dt * casadi.sumsqr(u)
@@ -169,7 +173,7 @@ def _solve(scene: Scene, reference: Reference, clear_m: float, seconds: float) -
     )
 
 
-def _advanced(casadi: Any, x: Any, u: Any, dt: Any, wheelbase: float) -> Any:
+def _advanced(x: Any, u: Any, dt: Any, wheelbase: float) -> Any:
     """Return the states after an interval with constant controls (Runge-Kutta, fourth order)."""
 
     def rate(x: Any) -> Any:
@@ -220,7 +224,8 @@ def _at(time_s: FloatArray, knots: FloatArray, at: float) -> FloatArray:
     return np.array([np.interp(at, time_s, column) for column in knots.T])
 
 
-def require_casadi() -> Any:
-    """Return the module of CasADi."""
-    with with_extra("shortening drives", "optimal"):
-        return import_module("casadi")
+if __name__ == "__main__":
+    for seed in range(SCENES):
+        drive = park(level_scene("perpendicular-normal", seed, TPCAP))
+        shorter = shorten(drive, DEADLINE_S)
+        print(f"{drive.scene.name}: {drive.time_s:.1f} s, shortened {shorter.time_s:.1f} s")
