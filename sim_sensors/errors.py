@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -31,7 +33,6 @@ def as_floats(name: str, value: ArrayLike, *shape: int | None) -> FloatArray:
 
 
 def as_integers(name: str, value: ArrayLike, n: int, least: int | None = None) -> IntArray:
-    """Return `value` as (n,) int64."""
     array = np.asarray(value)
     if array.shape != (n,) or (n and not np.issubdtype(array.dtype, np.integer)):
         raise SensorError(f"{name} has shape {array.shape} of {array.dtype}, want ({n},) integers")
@@ -40,7 +41,25 @@ def as_integers(name: str, value: ArrayLike, n: int, least: int | None = None) -
     return array.astype(np.int64)
 
 
+def require_numbers(
+    owner: object,
+    names: str,
+    *,
+    least: float = -math.inf,
+    above: float = -math.inf,
+    most: float = math.inf,
+    below: float = math.inf,
+) -> None:
+    """Check that attributes of an object are finite numbers within limits."""
+    for name in names.split():
+        value = getattr(owner, name)
+        is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if not (is_number and math.isfinite(value) and least <= value <= most and above < value < below):
+            limits = {"at least": least, "above": above, "at most": most, "below": below}
+            wanted = "".join(f", {word} {end:g}" for word, end in limits.items() if math.isfinite(end))
+            raise SensorError(f"{name} is {value!r}, want a finite number{wanted}")
+
+
 def require_seed(seed: object) -> None:
-    """Check that a seed is an integer of 0 or more."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise SensorError(f"seed is {seed!r}, want an integer, 0 or more")

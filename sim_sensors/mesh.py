@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import Float32Array
 
 Material = IntEnum(
-    "Material",
-    "PAINT GLASS TRIM RUBBER RIM LAMP PLATE INTERIOR CHROME FACADE FOLIAGE BARK STONE POST CLOTH",
-    start=0,
+    "Material", "PAINT GLASS TRIM RUBBER RIM LAMP PLATE INTERIOR CHROME FOLIAGE BARK STONE CLOTH", start=0
 )
 """Materials, each with its own shading: clear-coated paint, glass, dark plastic (trim), rubber, ... the stone of kerbs
 and walls, and the cloth of pedestrians. An interior is seats and dashboard behind glass."""
@@ -33,8 +31,6 @@ class Mesh:
 
 
 class MeshArrays(NamedTuple):
-    """The arrays of a pool for compiled code."""
-
     vertices: Float32Array
     normals: Float32Array
     triangles: NDArray[np.int32]
@@ -67,8 +63,6 @@ class MeshPool:
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """Poses of copies of meshes."""
-
     mesh: NDArray[np.int32]  # (n,) int32, index into the pool
     pose: NDArray[np.float64]  # (n, 4) float64, x, y, z in m and yaw in rad, world frame
     # (n,) int32, value in the camera's instance image: 0 for scenery, above 0 for vehicles

@@ -58,7 +58,6 @@ class Movers:
 
     @property
     def gait(self) -> IntArray:
-        """Phase of each pedestrian's stride, (p,) int64, 0 to `GAITS` - 1."""
         return np.round(self.walker_stride * GAITS).astype(np.int64) % GAITS
 
 

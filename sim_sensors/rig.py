@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.compiled.arrays import FloatArray
 from sim_sensors.camera.models import Drawable, Frame, PinholeCamera, StereoCamera, StereoFrame, camera_pose
 from sim_sensors.camera.weather import Weather
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, require_numbers
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
 
@@ -54,11 +53,8 @@ class Mount:
     pitch: float = 0.0
 
     def __post_init__(self) -> None:
-        values = (self.x, self.y, self.z, self.yaw, self.pitch)
-        if not all(math.isfinite(v) for v in values):
-            raise SensorError(f"mount is {values}, want finite numbers")
-        if self.z <= 0.0:
-            raise SensorError(f"mount z is {self.z} m, want above the ground")
+        require_numbers(self, "x y yaw pitch")
+        require_numbers(self, "z", above=0.0)
 
     def in_world(self, vehicle: FloatArray) -> tuple[float, float, float]:
         """Return the sensor's x, y in m and yaw in rad in the world frame, for a vehicle at (3,) x, y, yaw."""
@@ -247,13 +243,6 @@ class SensorRig:
         if self.lasers:
             _ = scene.scan_plane
 
-    def drive(
-        self, scene: Sensed, path: ArrayLike, every: float, weather: Weather | None = None, seed: int = 0
-    ) -> Iterator[Capture]:
-        """Yield captures along a path (see `poses_along`); the k-th one uses the seed `seed + k`."""
-        for k, pose in enumerate(poses_along(path, every)):
-            yield self.capture(scene, pose, weather, seed + k)
-
 
 def poses_along(path: ArrayLike, every: float) -> FloatArray:
     """Return vehicle poses at equal distances along a polyline, including both ends, with headings along it.
@@ -281,8 +270,7 @@ def poses_along(path: ArrayLike, every: float) -> FloatArray:
     # A last step much shorter than the others is a rounding error.
     at = np.r_[at[at < station[-1] - 1e-6 * every], station[-1]]
     leg = np.clip(np.searchsorted(station, at, side="right") - 1, 0, len(length) - 1)
-    share = (at - station[leg]) / length[leg]
-    xy = points[leg] + share[:, None] * step[leg]
+    xy = points[leg] + ((at - station[leg]) / length[leg])[:, None] * step[leg]
     return np.column_stack([xy, np.arctan2(step[leg, 1], step[leg, 0])])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.errors import SensorError, as_floats, as_integers
@@ -22,10 +20,6 @@ from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import COARSE, DETAILED, FOOTPRINT_CORNERS, VehicleModel
 
 NO_VEHICLE = -1
-
-
-class OverlapWarning(UserWarning):
-    """Two vehicles of a scene overlap."""
 
 
 class Footprints(NamedTuple):
@@ -49,11 +43,9 @@ class Fleet:
         self.surroundings = surroundings
 
     def with_model(self, model: VehicleModel) -> Fleet:
-        """Return a fleet with one more model, after the others; existing meshes are shared."""
         larger = Fleet((*self.models, model), self.surroundings)
         if "pool" in self.__dict__:
-            pair = [model.mesh(DETAILED), model.mesh(COARSE)]
-            larger.__dict__["pool"] = _joined(self.pool, pair)
+            larger.__dict__["pool"] = _joined(self.pool, [model.mesh(DETAILED), model.mesh(COARSE)])
         return larger
 
     def require_models(self, model: IntArray) -> None:
@@ -84,9 +76,6 @@ class Fleet:
     def mesh_of(self, model: IntArray) -> NDArray[np.int32]:
         return (len(self._scenery[0]) + LOOKS * GAITS + 2 * model).astype(np.int32)
 
-    def mesh_of_walkers(self, movers: Movers) -> NDArray[np.int32]:
-        return (len(self._scenery[0]) + GAITS * movers.walker_look + movers.gait).astype(np.int32)
-
     @cached_property
     def scenery_instances(self) -> Instances:
         things = self.surroundings.standing
@@ -99,7 +88,6 @@ class Fleet:
 
     @cached_property
     def sizes(self) -> FloatArray:
-        """(n_models, 3) float64, m: length, width, height."""
         return np.array([m.size for m in self.models]).reshape(-1, 3)
 
     @cached_property
@@ -128,9 +116,6 @@ class Scene:
     Raises:
         SensorError: a shape is wrong, a pose is not finite, or the fleet does not have a model.
 
-    Warns:
-        OverlapWarning: two vehicles' rectangles overlap.
-
     Examples:
         >>> scene = Scene.from_arrays([[0, 0, 0], [0, 3, 0.02]], seeds=[1, 2], bodies=["van", None])
         >>> scene.n_vehicles, scene.without_vehicle(0).instances.ids.tolist()
@@ -147,11 +132,6 @@ class Scene:
         model = as_integers("vehicle_model", self.vehicle_model, len(pose), least=NO_VEHICLE)
         self.fleet.require_models(model)
         self._set(pose, model, self.fleet)
-        pairs = overlapping(pose[self.present], self.fleet.sizes[model[self.present]])
-        if len(pairs):
-            first, second = self.present[pairs[0]]
-            text = f"vehicles {first} and {second} overlap ({len(pairs)} such pairs)"
-            warnings.warn(text, OverlapWarning, stacklevel=3)
 
     def _set(self, pose: FloatArray, model: IntArray, fleet: Fleet, movers: Movers | None = None) -> None:
         for array in (pose, model):
@@ -232,7 +212,8 @@ class Scene:
             return still
         pose = np.zeros((movers.n_vehicles + movers.n_walkers, 4))
         pose[:, [0, 1, 3]] = np.concatenate([movers.vehicle_pose, movers.walker_pose])
-        mesh = [self.fleet.mesh_of(movers.vehicle_model), self.fleet.mesh_of_walkers(movers)]
+        walkers = len(self.fleet._scenery[0]) + GAITS * movers.walker_look + movers.gait
+        mesh = [self.fleet.mesh_of(movers.vehicle_model), walkers.astype(np.int32)]
         return Instances(
             np.concatenate([still.mesh, *mesh]),
             np.concatenate([still.pose, pose]),
@@ -322,9 +303,6 @@ class Scene:
 
         Raises:
             SensorError: the place does not exist, the pose is not finite, or an empty place gets no model.
-
-        Warns:
-            OverlapWarning: the vehicle overlaps another one.
         """
         self._check_place(i)
         fleet, number = self.fleet, int(self.vehicle_model[i])
@@ -369,46 +347,15 @@ class Scene:
         new_model[i] = number
         scene = object.__new__(Scene)
         scene._set(new_pose, new_model, fleet, self.movers)
-        if number != NO_VEHICLE:
-            others = scene.present[scene.present != i]
-            away = np.hypot(*(new_pose[others, :2] - new_pose[i, :2]).T)
-            sizes = fleet.sizes[new_model]
-            reach = 0.5 * (np.hypot(sizes[others, 0], sizes[others, 1]) + np.hypot(sizes[i, 0], sizes[i, 1]))
-            near = others[away < reach]
-            hit = [j for j in near if _rectangles_meet(new_pose[[i, j]], sizes[[i, j]])]
-            if hit:
-                warnings.warn(f"vehicles {i} and {hit[0]} overlap", OverlapWarning, stacklevel=3)
         if "scan_plane" in self.__dict__:
             scene.__dict__["scan_plane"] = self.scan_plane.with_footprint(i, scene.footprint(i))
         return scene
 
 
-def overlapping(pose: FloatArray, size: FloatArray) -> IntArray:
-    """Return the pairs of vehicles whose rectangles, (n, 3) poses and sizes, overlap: (k, 2) int64, ascending."""
-    if len(pose) < 2:
-        return np.empty((0, 2), dtype=np.int64)
-    reach = float(np.hypot(size[:, 0], size[:, 1]).max())
-    pairs = np.sort(cKDTree(pose[:, :2]).query_pairs(reach, output_type="ndarray"), axis=1)
-    hits = [p for p in pairs.tolist() if _rectangles_meet(pose[p], size[p])]
-    return np.array(sorted(hits), dtype=np.int64).reshape(-1, 2)
-
-
-def _rectangles_meet(pose: FloatArray, size: FloatArray) -> bool:
-    axis = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
-    axes = np.concatenate([axis, np.stack([-axis[:, 1], axis[:, 0]], axis=-1)])
-    across = np.stack([-axis[:, 1], axis[:, 0]], axis=-1)
-    reach = sum(
-        0.5 * size[k, 0] * np.abs(axes @ axis[k]) + 0.5 * size[k, 1] * np.abs(axes @ across[k])
-        for k in (0, 1)
-    )
-    return bool((np.abs(axes @ (pose[1, :2] - pose[0, :2])) < reach).all())
-
-
 def _placed(outline: FloatArray, pose: FloatArray) -> FloatArray:
     c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
     x = c * outline[..., 0] - s * outline[..., 1] + pose[:, 0, None]
-    y = s * outline[..., 0] + c * outline[..., 1] + pose[:, 1, None]
-    return np.stack([x, y], axis=-1)
+    return np.stack([x, s * outline[..., 0] + c * outline[..., 1] + pose[:, 1, None]], axis=-1)
 
 
 def _padded(outlines: Sequence[FloatArray]) -> tuple[FloatArray, IntArray]:

@@ -1,8 +1,7 @@
-"""Meshes of scenery: buildings, walls, kerbs, trees, lamp posts, pedestrians."""
+"""Meshes of scenery: buildings, walls, trees, pedestrians."""
 
 from __future__ import annotations
 
-import itertools
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -15,8 +14,6 @@ from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Material, Mesh
 
 TRUNK_M = 0.16  # radius of a tree's trunk at knee height, for a tree of 7 m
-LAMP_POST_M = 0.08  # radius of a lamp post at knee height
-KERB_M = (0.14, 0.12)  # width and height of a kerb
 
 _STOREY = 3.0
 _BAY = 2.7
@@ -26,7 +23,7 @@ _STEP = 0.76  # m, length of a walking step
 
 _Part = IntEnum(
     "_Part",
-    "WALL PLINTH FRAME GLASS ROOM DOOR ROOF BARK LEAVES LEAVES_DARK POST LANTERN STONE COPING SKIN HAIR COAT TROUSERS "
+    "WALL PLINTH FRAME GLASS ROOM DOOR ROOF BARK LEAVES LEAVES_DARK STONE COPING SKIN HAIR COAT TROUSERS "
     "SHOES",
     start=0,
 )
@@ -37,8 +34,6 @@ for _material, _parts in {
     Material.INTERIOR: (_Part.ROOM,),
     Material.BARK: (_Part.BARK,),
     Material.FOLIAGE: (_Part.LEAVES, _Part.LEAVES_DARK),
-    Material.POST: (_Part.POST,),
-    Material.LAMP: (_Part.LANTERN,),
     Material.CLOTH: (_Part.SKIN, _Part.HAIR, _Part.COAT, _Part.TROUSERS, _Part.SHOES),
 }.items():
     _MATERIAL[list(_parts)] = _material
@@ -64,8 +59,7 @@ def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
     for a, b in zip(corner, np.roll(corner, -1, axis=0), strict=True):
         _add_facade(build, a, b, height, rng)
     for i, j, k in _ears(corner):
-        top = np.column_stack([corner[[i, j, k]], np.full(3, height)])
-        build.fan(top, _Part.ROOF)
+        build.fan(np.column_stack([corner[[i, j, k]], np.full(3, height)]), _Part.ROOF)
     frame = (232, 231, 226) if rng.random() < 0.6 else (70, 72, 76)
     return _made(
         build,
@@ -180,14 +174,6 @@ def wall_mesh(start: ArrayLike, end: ArrayLike, height: float, thickness: float,
     return _made(build, {_Part.STONE: tone, _Part.COPING: 1.12 * tone})
 
 
-def kerb_mesh(line: ArrayLike) -> Mesh:
-    point = np.asarray(line, dtype=np.float64)
-    build = ShapeBuilder()
-    for a, b in itertools.pairwise(point):
-        _add_bar(build, a, b, (0.0, KERB_M[1]), KERB_M[0], _Part.STONE)
-    return _made(build, {_Part.STONE: (158, 156, 150)})
-
-
 def _add_bar(
     build: ShapeBuilder, a: FloatArray, b: FloatArray, levels: tuple[float, float], width: float, part: _Part
 ) -> None:
@@ -247,18 +233,6 @@ def _add_ball(
     build.grid(center + unit * reach[..., None] * radius, part)
 
 
-def lamp_post_mesh(height: float = 5.5) -> Mesh:
-    build = ShapeBuilder()
-    foot, neck = LAMP_POST_M, 0.55 * LAMP_POST_M
-    build.turned(
-        [[1.3 * foot, 0.0], [1.3 * foot, 0.35], [foot, 0.42], [neck, height], [0.0, height]], _Part.POST, 8
-    )
-    build.box((0.42, 0.0, height - 0.05), (0.9, 0.06, 0.06), _Part.POST)
-    build.box((0.85, 0.0, height - 0.06), (0.55, 0.20, 0.10), _Part.POST, taper=(0.8, 0.6), faces="xXyYZ")
-    build.box((0.85, 0.0, height - 0.115), (0.46, 0.16, 0.02), _Part.LANTERN, faces="xXyYz")
-    return _made(build, {_Part.POST: (96, 100, 102), _Part.LANTERN: (232, 230, 220)})
-
-
 GAITS = 8  # number of phases of a stride for which meshes are shared
 
 
@@ -272,8 +246,7 @@ def pedestrian_mesh(phase: float, seed: int) -> Mesh:
     for side in (1.0, -1.0):
         foot = np.array([0.5 * _STEP * swing * side, 0.10 * side, 0.06 + 0.03 * (1 - abs(swing))])
         knee = np.array([0.5 * foot[0] + 0.09, 0.10 * side, 0.50])
-        joint = np.array([0.0, 0.09 * side, hip])
-        _add_limb(build, joint, knee, (0.085, 0.065), _Part.TROUSERS)
+        _add_limb(build, np.array([0.0, 0.09 * side, hip]), knee, (0.085, 0.065), _Part.TROUSERS)
         _add_limb(build, knee, foot, (0.065, 0.045), _Part.TROUSERS)
         build.box(foot + np.array([0.06, 0.0, -0.02]), (0.27, 0.09, 0.08), _Part.SHOES, taper=(0.8, 0.9))
         elbow = np.array([-0.16 * swing * side - 0.03, 0.25 * side, 1.14])
@@ -337,7 +310,6 @@ def pedestrian_footprint(phase: float) -> FloatArray:
 
 
 def round_footprint(radius: float) -> FloatArray:
-    """Return an octagon with the area of a round post, (8, 2) float64, m, counter-clockwise."""
     turn = np.arange(8) * np.pi / 4
     corner = radius * np.sqrt(np.pi / (2 * np.sqrt(2)))
     return np.asarray(corner * np.column_stack([np.cos(turn), np.sin(turn)]))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from sim_sensors.errors import SensorError, as_floats, as_integers, require_seed
+from sim_sensors.errors import SensorError, as_floats, as_integers, require_numbers, require_seed
 from sim_sensors.scene import NO_VEHICLE, Fleet, Scene
 from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
@@ -42,18 +42,14 @@ class ParkingManners:
     overhang_m: float = 0.20
 
     def __post_init__(self) -> None:
-        for name in ("lateral_m", "along_m", "yaw_rad", "door_room_m", "overhang_m"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise SensorError(f"{name} is {value}, want a finite number of 0 or more")
-        if not 0.0 <= self.nose_out <= 1.0:
-            raise SensorError(f"nose_out is {self.nose_out}, want a share from 0 to 1")
+        require_numbers(self, "lateral_m along_m yaw_rad door_room_m overhang_m", least=0.0)
+        require_numbers(self, "nose_out", least=0.0, most=1.0)
 
 
-@lru_cache(maxsize=4)
-def vehicle_library(n_models: int = LIBRARY_MODELS) -> tuple[VehicleModel, ...]:
-    """Return the vehicle models of seeds 0 to n - 1, with bodies, sizes and paints drawn by frequency."""
-    return tuple(VehicleModel.from_seed(None, seed) for seed in range(n_models))
+@lru_cache(maxsize=1)
+def vehicle_library() -> tuple[VehicleModel, ...]:
+    """Return the vehicle models from which cars are drawn, with bodies, sizes and paints drawn by frequency."""
+    return tuple(VehicleModel.from_seed(None, seed) for seed in range(LIBRARY_MODELS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +66,6 @@ class SlotLot:
         kerbside: (n,) or () bool, slots that lie along the lane.
         surroundings: ground and scenery; None: asphalt under and around the slots, and painted lines.
         manners: distribution of parking poses.
-        n_models: number of vehicle models.
         seed: 0 or more.
 
     Raises:
@@ -84,7 +79,6 @@ class SlotLot:
     kerbside: ArrayLike = False
     surroundings: Surroundings | None = None
     manners: ParkingManners = field(default_factory=ParkingManners)
-    n_models: int = LIBRARY_MODELS
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -101,8 +95,6 @@ class SlotLot:
             raise SensorError(f"kerbside has shape {np.asarray(self.kerbside).shape}, want ({n},)")
         object.__setattr__(self, "kerbside", np.broadcast_to(np.asarray(self.kerbside, dtype=bool), (n,)))
         require_seed(self.seed)
-        if self.n_models < 1:
-            raise SensorError(f"n_models is {self.n_models}, want 1 or more")
         if self.surroundings is None:
             object.__setattr__(self, "surroundings", slot_surroundings(self))
         lonely = [i for i in range(n) if not len(self.fitting[i])]
@@ -117,12 +109,12 @@ class SlotLot:
     def fleet(self) -> Fleet:
         """All models, with the surroundings."""
         assert self.surroundings is not None
-        return Fleet(vehicle_library(self.n_models), self.surroundings)
+        return Fleet(vehicle_library(), self.surroundings)
 
     @cached_property
     def fitting(self) -> list[IntArray]:
         """The models that fit each slot."""
-        size = np.array([m.size for m in vehicle_library(self.n_models)])
+        size = np.array([m.size for m in vehicle_library()])
         spare = np.where(self._column("kerbside"), -self.manners.overhang_m, self.manners.overhang_m)
         # In kerbside slots doors open over the pavement and the street.
         room = np.where(self._column("kerbside"), KERB_ROOM_M, self.manners.door_room_m)
@@ -203,8 +195,7 @@ def slot_surroundings(lot: SlotLot, lanes: Sequence[ArrayLike] = (), **more: obj
     if len(point) and not paved:
         low, high = point.min(axis=0) - PAVED_MARGIN_M, point.max(axis=0) + PAVED_MARGIN_M
         paved = [np.array([low, [high[0], low[1]], high, [low[0], high[1]]])]
-    markings = np.concatenate([ends, np.asarray(plain.markings)])
-    return replace(plain, paved=paved, markings=markings)
+    return replace(plain, paved=paved, markings=np.concatenate([ends, np.asarray(plain.markings)]))
 
 
 def slot_lines(lot: SlotLot) -> FloatArray:
@@ -212,8 +203,7 @@ def slot_lines(lot: SlotLot) -> FloatArray:
     xy, yaw = np.asarray(lot.slot_xy), np.asarray(lot.slot_yaw)
     half = 0.5 * np.column_stack([np.asarray(lot.slot_length), np.asarray(lot.slot_width)])
     heading = np.column_stack([np.cos(yaw), np.sin(yaw)])
-    left = np.column_stack([-heading[:, 1], heading[:, 0]])
-    ahead, aside = half[:, :1] * heading, half[:, 1:] * left
+    ahead, aside = half[:, :1] * heading, half[:, 1:] * np.column_stack([-heading[:, 1], heading[:, 0]])
     corner = {(i, j): xy + i * ahead + j * aside for i in (-1, 1) for j in (-1, 1)}
     kerb = np.asarray(lot.kerbside)
     lines = [np.hstack([corner[-1, j], corner[1, j]]) for j in (-1, 1)]

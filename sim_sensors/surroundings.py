@@ -30,7 +30,7 @@ class Standing(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Ground, buildings, walls, kerbs, trees, lamp posts and people; world frame, SI units.
+    """Ground, buildings, walls, trees and people; world frame, SI units.
 
     Args:
         paved: polygons, (k, 2) m, of asphalt.
@@ -38,9 +38,7 @@ class Surroundings:
         buildings: outlines, (k, 2) m, simple polygons.
         building_heights: (n_buildings,) m; None: 9 m each.
         walls: (n, 5) m: both ends of free-standing walls, and their height.
-        kerbs: polylines, (k, 2) m.
         trees: (n, 3) m: x, y, height.
-        lamp_posts: (n, 3): x, y in m, yaw of the arm in rad.
         pedestrians: (n, 4): x, y in m, yaw in rad, phase of the stride in turns.
         seed: 0 or more, seed of textures, trees, clothes and windows.
 
@@ -54,25 +52,21 @@ class Surroundings:
     buildings: Sequence[ArrayLike] = ()
     building_heights: ArrayLike | None = None
     walls: ArrayLike = ()
-    kerbs: Sequence[ArrayLike] = ()
     trees: ArrayLike = ()
-    lamp_posts: ArrayLike = ()
     pedestrians: ArrayLike = ()
     seed: int = 0
     _outlines: tuple[FloatArray, ...] = field(init=False, repr=False, default=())
 
     def __post_init__(self) -> None:
         require_seed(self.seed)
-        tables = {"markings": 5, "walls": 5, "trees": 3, "lamp_posts": 3, "pedestrians": 4}
+        tables = {"markings": 5, "walls": 5, "trees": 3, "pedestrians": 4}
         for name, columns in tables.items():
             object.__setattr__(self, name, as_floats(name, getattr(self, name), None, columns))
-        for name, least in (("paved", 3), ("buildings", 3), ("kerbs", 2)):
+        for name in ("paved", "buildings"):
             rows = tuple(as_floats(f"{name}[{i}]", row, None, 2) for i, row in enumerate(getattr(self, name)))
-            short = [i for i, row in enumerate(rows) if len(row) < least]
+            short = [i for i, row in enumerate(rows) if len(row) < 3]
             if short:
-                raise SensorError(
-                    f"{name}[{short[0]}] has {len(rows[short[0]])} points, want {least} or more"
-                )
+                raise SensorError(f"{name}[{short[0]}] has {len(rows[short[0]])} points, want 3 or more")
             object.__setattr__(self, name, rows)
         heights = (
             np.full(len(self.buildings), 9.0) if self.building_heights is None else self.building_heights
@@ -121,9 +115,6 @@ class Surroundings:
                 [0, 0], [x1 - x0, y1 - y0], height + 0.002 * (i % 4), WALL_THICKNESS_M, self.seed
             )
             things.append(Standing(mesh, (x0, y0, 0.0)))
-        for line in self.kerbs:
-            start = np.asarray(line)[0]
-            things.append(Standing(scenery.kerb_mesh(np.asarray(line) - start), (start[0], start[1], 0.0)))
         trees = self._table("trees")
         kinds: dict[tuple[float, int], Mesh] = {}
         for i, (x, y, height) in enumerate(trees.tolist()):
@@ -132,10 +123,6 @@ class Surroundings:
                 kinds[key] = scenery.tree_mesh(key[0], self.seed * TREE_KINDS + key[1])
             trunk = scenery.round_footprint(scenery.TRUNK_M * key[0] / 7.0)
             things.append(Standing(kinds[key], (x, y, 2.4 * i), trunk))
-        post = scenery.lamp_post_mesh() if len(self._table("lamp_posts")) else None
-        for x, y, yaw in self._table("lamp_posts").tolist():
-            assert post is not None
-            things.append(Standing(post, (x, y, yaw), scenery.round_footprint(scenery.LAMP_POST_M)))
         for i, (x, y, yaw, phase) in enumerate(self._table("pedestrians").tolist()):
             gait = round(phase * scenery.GAITS) % scenery.GAITS / scenery.GAITS
             person = scenery.pedestrian_mesh(gait, self.seed * 4096 + i)

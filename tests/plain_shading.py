@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_sensors.camera.materials import LINEAR, RESPONSE, facade
+from sim_sensors.camera.materials import LINEAR, RESPONSE
 from sim_sensors.camera.sky import mirrored_sky, sky_of_view
 from sim_sensors.camera.textures import cloud_tile, grain_tile
 from sim_sensors.mesh import Material
@@ -161,7 +161,7 @@ class _PlainView:
     def _surface(self, t, point, ray, normal, footprint):
         material = self.triangles.material[t]
         mirror, width, roughness, received = RESPONSE[material].astype(float)
-        albedo, glow = LINEAR[self.triangles.color[t]].astype(float), 0.0
+        albedo = LINEAR[self.triangles.color[t]].astype(float)
         cosine = -normal @ ray
         inside = cosine < 0.0 and material == Material.PAINT
         if cosine < 0.0:
@@ -172,10 +172,6 @@ class _PlainView:
         size = 0.35 if material == Material.FOLIAGE else 0.9
         u, v = along * size + point[0] * 0.11, (point[2] + 0.5 * point[1]) * size
         blotch = _tile(cloud_tile(), u, v, _tile_level(footprint * size))
-        if material == Material.FACADE:
-            wall = [np.float32(n) for n in (along, point[2], normal[2], footprint, self.weather.lit_windows)]
-            tone, glow, mirror = facade(*wall, grain_tile())
-            albedo = albedo * tone
         if material == Material.FOLIAGE:
             u, v = along * 0.31 + point[0] * 0.2, point[2] * 0.31 + point[1] * 0.17
             leaf = _tile(grain_tile(), u, v, _tile_level(footprint * 0.3))
@@ -202,7 +198,7 @@ class _PlainView:
             color = color + (self._mirrored(point, reflected) - color) * mirror
             glint = max(0.0, 1.0 - (1.0 - reflected @ self.to_sun) / (4.0 * width)) ** 3
             color = color + self.sun * glint * reaches * mirror * 0.05 / width
-        return color + glow * np.array([1.0, 0.85, 0.6])
+        return color
 
     def _through(self, color, n_panes, point, ray, normal):
         cosine = -normal @ ray

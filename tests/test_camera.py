@@ -3,7 +3,6 @@
 import math
 import pickle
 from copy import copy
-from dataclasses import replace
 
 import cv2
 import numba
@@ -11,7 +10,7 @@ import numpy as np
 import plain_sky
 import pytest
 from plain_shading import plain_radiance
-from toy_scene import ToyScene, box_mesh, parked_cars, random_boxes, toy_scene
+from toy_scene import box_mesh, parked_cars, random_boxes, toy_scene
 
 from parkenv.perception.range_scan import disparity
 from sim_sensors import SensorError, SlotLot
@@ -24,7 +23,7 @@ from sim_sensors.camera.shadows import light_maps
 from sim_sensors.camera.sky import mirrored_sky, sky_of_view
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.ground_truth import View, vehicle_boxes
-from sim_sensors.mesh import Instances, Material
+from sim_sensors.mesh import Material
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240)
 POSE = camera_pose(0.0, 0.0, 1.4, 0.4, -0.05)
@@ -82,7 +81,7 @@ def test_the_sky_is_that_of_plain_numpy(preset):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_shading_is_that_of_plain_python(preset):
-    paint, wall = box_mesh(4.3, 1.8, 1.4), box_mesh(3.0, 0.3, 6.0, Material.FACADE)
+    paint, wall = box_mesh(4.3, 1.8, 1.4), box_mesh(3.0, 0.3, 6.0, Material.STONE)
     bush, pane = box_mesh(1.5, 1.0, 1.2, Material.FOLIAGE), box_mesh(1.5, 0.1, 1.1, Material.GLASS)
     placed = [(0, 5.0, 1.0, 0.0, 0.4), (0, 11.0, -3.0, 0.0, 1.2), (1, 14.0, 3.0, 0.0, 1.5)]
     placed += [(2, 5.0, -1.6, 0.0, 0.3), (3, 2.6, -0.4, 0.6, 1.7)]
@@ -92,7 +91,11 @@ def test_shading_is_that_of_plain_python(preset):
     maps = light_maps(scene.pool, scene.instances, weather, 8.0, 0.0)
     ground = ground_texture(scene.ground)
     seen = (*camera.visibility(scene, pose), pose, camera.intrinsics, weather, ground, maps)
-    assert set(seen[0].material[np.unique(seen[1].triangle[seen[1].triangle >= 0])]) == {0, 9, 10}
+    assert set(seen[0].material[np.unique(seen[1].triangle[seen[1].triangle >= 0])]) == {
+        Material.PAINT,
+        Material.FOLIAGE,
+        Material.STONE,
+    }
     assert (seen[1].pane >= 0).mean() > 0.01
     ours, plain = shade(*seen), plain_radiance(*seen)
     off = np.abs(ours - plain) / (plain + 0.1 * plain.mean())
@@ -100,21 +103,14 @@ def test_shading_is_that_of_plain_python(preset):
     assert np.quantile(off, 0.99) < 0.02
 
 
-def test_truth_is_computed_when_asked_for_and_travels(scene):
-    frame = CAMERA.render(scene, POSE)
-    again = pickle.loads(pickle.dumps(frame))
-    np.testing.assert_array_equal(again.depth, frame.depth)
-    np.testing.assert_array_equal(again.ids, frame.ids)
-    assert pickle.loads(pickle.dumps(frame)).glass_depth.shape == frame.glass_depth.shape
-
-
-def test_noise_follows_the_seed_and_geometry_does_not(scene):
+def test_noise_follows_the_seed_geometry_does_not_and_truth_travels(scene):
     one, other = CAMERA.render(scene, POSE, seed=1), CAMERA.render(scene, POSE, seed=2)
     difference = one.image.astype(int) - other.image.astype(int)
     assert 0.3 < difference.std() < 8.0
     assert abs(difference.mean()) < 0.2
-    assert np.array_equal(one.depth, other.depth)
-    assert np.array_equal(one.ids, other.ids)
+    for frame in (other, pickle.loads(pickle.dumps(one))):
+        for name in ("depth", "ids", "glass_depth"):
+            np.testing.assert_array_equal(getattr(frame, name), getattr(one, name))
 
 
 def test_same_bytes_on_any_number_of_threads(scene):
@@ -145,14 +141,6 @@ def test_depth_is_of_what_is_opaque_and_ids_of_what_is_first(row):
     assert np.median(frame.depth[body]) == pytest.approx(5.1, abs=0.05)
 
 
-def test_supersampling_changes_the_picture_and_not_the_truth(scene):
-    plain, fine = CAMERA.render(scene, POSE), replace(CAMERA, supersampling=2).render(scene, POSE)
-    assert np.array_equal(plain.depth, fine.depth)
-    assert np.array_equal(plain.ids, fine.ids)
-    difference = np.abs(plain.image.astype(int) - fine.image.astype(int))
-    assert 0.5 < difference.mean() < 8.0
-
-
 def test_shadows_lie_away_from_the_sun():
     scene = toy_scene([box_mesh(4.0, 2.0, 1.5)], [(0, 0.0, 0.0, 0.0, 0.0)], [1])
     weather = Weather(sun_azimuth=0.0, sun_elevation=math.radians(45.0))
@@ -164,17 +152,6 @@ def test_shadows_lie_away_from_the_sun():
     assert sunlit(maps, 0.0, 0.0, 1.6, 0.05) == 1.0
     assert open_sky(maps, 0.0, 0.0) < 0.1
     assert open_sky(maps, 5.0, 0.0) > 0.99
-
-
-def test_shadows_follow_new_instances(row):
-    weather = Weather.draw("sunny", 0)
-    pose = camera_pose(0.0, 0.0, 1.4, -math.pi / 2)
-    full = CAMERA.render(row, pose, weather)
-    kept = [0, 1, 2, 3, 6, 7, 8, 9]
-    gone = Instances(row.instances.mesh[kept], row.instances.pose[kept], row.instances.ids[kept])
-    emptied = CAMERA.render(ToyScene(row.pool, gone, row.ground), pose, weather)
-    assert not (emptied.ids == 3).any()
-    assert not np.array_equal(full.image, emptied.image)
 
 
 @pytest.mark.parametrize("preset", ["low_sun", "rain"])
@@ -232,7 +209,7 @@ def test_stereo_measures_bodies_and_misses_windows():
     # T §3.3: through the windows a stereo camera sees what is behind, and the car seems farther than it is.
     scene, stereo = parked_cars(), StereoCamera(PinholeCamera.from_field_of_view())
     near, far, windows = [], [], []
-    for i in range(4):
+    for i in range(3):
         pose = camera_pose(-20.0 + 9.0 * i, 0.3, 1.35, -math.pi / 2, -0.04)
         pair = stereo.render_stereo(scene, pose, Weather.draw("sunny", i), i)
         shifts = disparity(pair, stereo)
@@ -248,12 +225,9 @@ def test_stereo_measures_bodies_and_misses_windows():
     assert np.median(np.concatenate(windows)) > 0.4
 
 
-def test_a_right_camera_stands_to_the_right():
+def test_camera_frame_is_right_down_forward_and_a_right_camera_stands_to_the_right():
     right = StereoCamera(baseline=0.12).right_pose(camera_pose(1.0, 2.0, 1.5, math.pi / 2))
     np.testing.assert_allclose(right[:3, 3], [1.12, 2.0, 1.5], atol=1e-12)
-
-
-def test_camera_frame_is_right_down_forward():
     pose = camera_pose(0.0, 0.0, 1.0, 0.0)
     np.testing.assert_allclose(pose[:3, :3].T, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
     assert camera_pose(0.0, 0.0, 1.0, 0.0, pitch=0.2)[2, 2] > 0.0
@@ -283,10 +257,8 @@ def test_noise_has_the_stated_deviation():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda _: PinholeCamera(width=0), "image size is 0×480"),
+        (lambda _: PinholeCamera(width=0), "width is 0"),
         (lambda _: PinholeCamera(fx=-1.0), "fx is -1.0"),
-        (lambda _: PinholeCamera(cy=math.nan), "cy is nan"),
-        (lambda _: PinholeCamera(supersampling=3), "supersampling is 3"),
         (lambda _: PinholeCamera(coarse_beyond=math.nan), "coarse_beyond is nan"),
         (lambda _: PinholeCamera.from_field_of_view(horizontal=4.0), "field of view is 4"),
         (lambda _: StereoCamera(baseline=0.0), "baseline is 0"),

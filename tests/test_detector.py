@@ -127,13 +127,13 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
     ("changed", "wanted"),
     [
         ({"calibration": (0.0, 1.0)}, r"calibration \(0.0, 1.0\), want finite numbers, the slope above 0"),
-        ({"calibration": (1.0, math.nan)}, "want finite numbers"),
         ({"bias": math.inf}, "bias is inf"),
+        ({"weights": np.zeros(3, np.float32)}, r"weights are \(3,\), want finite \(8, 9, 16\)"),
     ],
 )
 def test_bad_numbers_of_a_model_are_named(model, changed, wanted):
     with pytest.raises(InputError, match=wanted):
-        dataclasses.replace(model, **changed)
+        dataclasses.replace(model, **{"descriptor": Descriptor(), **changed})
 
 
 def test_the_shipped_models_are_small_and_say_what_they_know():
@@ -154,12 +154,9 @@ def test_any_size_and_colour_is_looked_at(model):
             detector.detect(bad)
 
 
-def test_of_boxes_that_overlap_the_best_is_kept():
+def test_of_boxes_that_overlap_the_best_is_kept_and_a_part_of_a_car_is_no_second_one():
     boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [20, 0, 30, 10]], np.float32)
     assert best_boxes(boxes, np.array([0.5, 0.9, 0.1], np.float32), 0.4).tolist() == [1, 2]
-
-
-def test_a_part_of_a_large_car_is_no_second_car_but_a_neighbour_is():
     # A car, its front wheel, a neighbour that hides a tenth of it, and a far car above its bonnet.
     boxes = np.array([[0, 0, 200, 80], [10, 40, 75, 66], [180, 0, 380, 80], [0, -20, 90, 16]], np.float32)
     by_overlap = best_boxes(boxes, np.array([0.9, 0.8, 0.7, 0.6], np.float32), 0.4)
@@ -210,7 +207,7 @@ def test_a_wide_box_is_no_front_where_photographs_of_sides_are_judged():
 
     photo = LabelledImage("photo", np.zeros((90, 210), np.uint8), np.array([[8.0, 5.0, 98.0, 45.0]]))
     score = score_on(Fixed(), [photo], "single")
-    assert (score.row["recall"], score.row["precision"]) == (1.0, 1.0)
+    assert (score["recall"], score["precision"]) == (1.0, 1.0)
 
 
 def test_crops_are_judged_by_a_box_in_their_middle(tmp_path):
@@ -273,16 +270,13 @@ def test_uiuc_is_read_as_published_trained_on_and_judged(tmp_path):
     assert [r["test_set"] for r in rows] == ["single", "multi"]
     assert rows[0]["cars"] == 4
     assert min(r["eer"] for r in rows) >= 0.75
-    assert (tmp_path / "scores" / "recall_precision.png").stat().st_size > 5000
 
 
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
         (lambda f: (f / "trueLocations.txt").write_text("0: (1,2,3)\n"), "line '0: .1,2,3.', want n:"),
-        (lambda f: (f / "trueLocations.txt").write_text("\n"), "trueLocations.txt: names no image"),
         (lambda f: (f / "trueLocations.txt").unlink(), "trueLocations.txt: no such file"),
-        (lambda f: (f / "TestImages/test-0.pgm").unlink(), "test-0.pgm: No such file"),
         (lambda f: os.truncate(f / "TestImages/test-0.pgm", 900), "test-0.pgm: is not a complete image"),
     ],
 )
@@ -293,34 +287,20 @@ def test_a_damaged_set_is_named(tmp_path, break_it, message):
         read_uiuc_test(tmp_path, "single")
 
 
-def test_too_little_to_train_on_is_said(crops):
-    with pytest.raises(InputError, match="3 positives and 60 negatives, want at least 20 and 1"):
-        train(crops[0][:3], crops[1])
-    with pytest.raises(InputError, match="penalty is 0"):
-        TrainingSettings(penalty=0.0)
-    with pytest.raises(InputError, match=r"enlarged is 0\.5, want 0 or 1 to 8"):
-        TrainingSettings(enlarged=0.5)
+def test_too_little_to_train_on_and_bad_settings_are_named(model, crops):
+    def hog(**settings):
+        return lambda: HogDetector(**{"models": (model,), **settings})
 
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"models": ()}, "models is empty"),
-        ({"least_height": 2.0}, "least_height is 2.0"),
-        ({"scale_step": 1.0}, "scale_step is 1.0"),
-        ({"threshold": 1.0}, "threshold is 1.0"),
-        ({"margin": -0.1}, "margin is -0.1"),
-        ({"inside": 1.2}, "inside is 1.2, want a finite number from 0 to 1"),
-    ],
-)
-def test_bad_detectors_are_named(model, settings, message):
-    with pytest.raises(InputError, match=message):
-        HogDetector(**{"models": (model,), **settings})
-
-
-def test_a_model_wants_weights_of_its_window():
-    with pytest.raises(InputError, match=r"weights are \(3,\), want finite \(8, 9, 16\)"):
-        CarModel(Descriptor(), np.zeros(3, np.float32), 0.0, 2.5)
+    for make, message in (
+        (lambda: train(crops[0][:3], crops[1]), "3 positives and 60 negatives, want at least 20 and 1"),
+        (lambda: TrainingSettings(penalty=0.0), "penalty is 0"),
+        (lambda: TrainingSettings(enlarged=0.5), r"enlarged is 0\.5, want 0 or 1 to 8"),
+        (hog(models=()), "models is empty"),
+        (hog(scale_step=1.0), "scale_step is 1.0"),
+        (hog(inside=1.2), "inside is 1.2, want a finite number from 0 to 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            make()
 
 
 def test_a_detector_that_does_not_exist_is_named(tmp_path):
@@ -330,24 +310,18 @@ def test_a_detector_that_does_not_exist_is_named(tmp_path):
         assert "detector 'nowhere:Mine': no module 'nowhere'" in refused.stderr
 
 
-def test_a_damaged_image_is_refused_before_any_is_searched(tmp_path):
-    photos, out = tmp_path / "photos", tmp_path / "out"
-    photos.mkdir()
-    whole = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
-    (photos / "a.png").write_bytes(whole)
-    (photos / "b.png").write_bytes(whole[:40])
-    refused = parkenv("detect", photos, "--out", out)
-    assert (refused.returncode, refused.stdout, out.exists()) == (2, "", False)
-    assert f"{photos / 'b.png'}: is not a complete image" in refused.stderr
-
-
 def grey_image(path):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(cv2.imencode(path.suffix, np.zeros((70, 140), np.uint8))[1].tobytes())
     return path
 
 
-def test_a_picture_never_replaces_an_image_that_is_searched(tmp_path):
+def test_a_damaged_image_is_refused_first_and_a_picture_never_replaces_an_image_that_is_searched(tmp_path):
+    os.truncate(grey_image(tmp_path / "photos" / "b.png"), 40)
+    grey_image(tmp_path / "photos" / "a.png")
+    refused = parkenv("detect", tmp_path / "photos", "--out", tmp_path / "out")
+    assert (refused.returncode, refused.stdout, (tmp_path / "out").exists()) == (2, "", False)
+    assert f"{tmp_path / 'photos' / 'b.png'}: is not a complete image" in refused.stderr
     a, before = grey_image(tmp_path / "a.png"), grey_image(tmp_path / "a_cars.png").read_bytes()
     refused = parkenv("detect", tmp_path, "--out", tmp_path)
     assert (refused.returncode, refused.stdout) == (2, "")

@@ -54,11 +54,7 @@ def test_any_number_of_panels_is_laid_out(kind, panels):
 
 
 def test_bars_stack_the_terms_and_an_agent_off_the_scale_is_cut():
-    rows = [
-        row("mdp"),
-        row("greedy-goal", drive=70.0, failed=0.0, price=10.0),
-        row("mdp-static", failed=5000.0),
-    ]
+    rows = [row(), row("greedy-goal", drive=70.0, failed=0.0, price=10.0), row("mdp-static", failed=5000.0)]
     (ax,) = draw_time_split(rows).axes
     left, limit = ax.get_xlim()
     assert left == 0.0
@@ -102,21 +98,9 @@ def test_lines_against_occupancy_are_labelled_where_they_end(tmp_path):
         assert image.size == (1500, 615)
 
 
-@pytest.mark.parametrize(
-    ("places", "want"),
-    [
-        ([], []),
-        ([0.5], [0.5]),
-        ([0.2, 0.5], [0.2, 0.5]),
-        ([0.5, 0.5], [0.5, 0.6]),
-        ([0.2, 1.0, 1.0], [0.2, 0.9, 1.0]),
-    ],
-)
-def test_labels_are_spread(places, want):
-    assert spread(places, 0.1) == pytest.approx(want)
-
-
-def test_every_agent_has_a_colour_of_its_own():
+def test_labels_are_spread_and_every_agent_has_a_colour_of_its_own():
+    for places, want in (([], []), ([0.2, 0.5, 0.5], [0.2, 0.5, 0.6]), ([0.2, 1.0, 1.0], [0.2, 0.9, 1.0])):
+        assert spread(places, 0.1) == pytest.approx(want)
     assert set(AGENT_NAMES) <= set(AGENT_COLORS)
     assert len(set(AGENT_COLORS.values())) == len(AGENT_COLORS)
 
@@ -146,12 +130,9 @@ def test_nothing_to_draw_is_refused(draw):
         draw([])
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_figures_come_out_the_same_and_a_place_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(InputError, match=r"missing/x\.png: cannot be written"):
         save_picture(draw_time_split([row()]), tmp_path / "missing" / "x.png")
-
-
-def test_figures_come_out_the_same_and_leave_nothing_beside(tmp_path):
     for name in ("a.png", "b.png"):
         save_picture(draw_time_split([row(), row("oracle")]), tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
@@ -190,7 +171,7 @@ def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_pat
     files = draw_figures(results, tmp_path)
     assert sorted(files) == sorted(tmp_path.iterdir())
     drawn = {name for name in FIGURES if any(file.name.startswith(name) for file in files)}
-    of_sweeps = {f"time_against_{what}" for what in ("failure_cost", "map", "decision_time")}
+    of_sweeps = {f"time_against_{what}" for what in ("failure_cost", "map")}
     assert drawn == FIGURES.keys() - of_sweeps
     (tmp_path / "map.png").touch()
     remove_figures(tmp_path)

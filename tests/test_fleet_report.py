@@ -108,14 +108,11 @@ def test_days_and_agents_can_be_chosen(run, tmp_path):
             make_report(run, ExecutionSpec(jobs=1), ReportOptions(**options), out=page)
 
 
-def test_a_day_that_differs_from_the_results_is_noted(run, tmp_path):
+def test_a_day_that_differs_is_noted_and_days_with_too_many_cars_are_not_replayed(run, tmp_path, monkeypatch):
     copy = shutil.copytree(run, tmp_path / "copy")
     change_rows(copy, lambda row: "total_s" in row and row.update(total_s=1.0))
     done = ran("report", copy, "--episodes", 1, "--jobs", 1)
     assert "days.csv says 1.00 s" in " ".join(done.stdout.split())
-
-
-def test_days_with_too_many_cars_are_not_replayed(run, tmp_path, monkeypatch):
     monkeypatch.setattr("parkenv.studies.fleet.day_replay.MOST_CARS", 15)
     make_report(run, ExecutionSpec(jobs=1), ReportOptions(episodes=1), out=tmp_path / "page.html")
     data = data_of(tmp_path / "page.html")

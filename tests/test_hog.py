@@ -38,6 +38,7 @@ def test_histograms_are_those_of_plain_numpy(noise):
     expected = plain_histograms(noise)
     found = cell_histograms(noise)
     assert found.shape == (5, 9, 7)
+    assert cell_histograms(np.zeros((5, 90), np.uint8)).shape == (0, 9, 11)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4 * expected.max())
 
 
@@ -99,7 +100,6 @@ def test_a_window_in_the_middle_is_the_crops_own_description():
     ("make", "message"),
     [
         (lambda: Descriptor(100, 64), "width is 100 px, want a multiple of 8"),
-        (lambda: Descriptor(128, 8), "height is 8 px"),
         (lambda: Descriptor(128, 64, "l1"), "normalization is 'l1'"),
         (lambda: Descriptor().describe(np.zeros((64, 64), np.uint8)), r"crop is \(64, 64\), want"),
         (lambda: cell_histograms(np.zeros((8, 8), np.float32)), "float32, want"),
@@ -108,7 +108,3 @@ def test_a_window_in_the_middle_is_the_crops_own_description():
 def test_bad_input_is_named(make, message):
     with pytest.raises(InputError, match=message):
         make()
-
-
-def test_an_image_smaller_than_a_cell_has_no_cells():
-    assert cell_histograms(np.zeros((5, 90), np.uint8)).shape == (0, 9, 11)

@@ -68,7 +68,7 @@ def compare(scanner, plane, pose, exclude=None):
     return int(edge.sum())
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32),
     n=st.integers(0, 60),
@@ -82,45 +82,38 @@ def test_scans_are_what_the_definition_says(seed, n, n_walls, extent, yaw, scann
     compare(scanner, plane, (0.0, 0.0, yaw))
 
 
-def test_few_beams_are_at_edges_in_a_large_sample():
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (413_000.25, 5_320_000.5)])
+def test_few_beams_are_at_edges_in_a_large_sample_near_the_origin_and_far_from_it(shift):
     rng = np.random.default_rng(1)
-    edges = beams = 0
-    for _ in range(10):
+    edges = 0
+    for _ in range(5):
         plane = random_plane(rng, int(rng.integers(20, 300)), int(rng.integers(0, 20)), 60.0)
+        corners, n_corners = plane.footprints
+        plane = ScanPlane(corners + shift, n_corners, plane.walls + shift)
         for pose in rng.uniform((-50, -50, -4), (50, 50, 4), (5, 3)):
-            edges += compare(LASER, plane, pose)
-            beams += LASER.n_beams
-    assert edges < 1e-3 * beams  # of 54,050
+            edges += compare(LASER, plane, pose + np.array([*shift, 0.0]))
+    assert edges < 1e-3 * 25 * LASER.n_beams
 
 
-def test_a_lot_far_from_the_origin_is_seen_as_exactly():
-    rng = np.random.default_rng(2)
-    near = random_plane(rng, 80, 6, 30.0)
-    corners, n_corners = near.footprints
-    shift = np.array([413_000.25, 5_320_000.5])
-    far = ScanPlane(corners + shift, n_corners, near.walls + shift)
-    assert compare(LASER, far, (*shift, 0.3)) < 10
-
-
-@pytest.mark.parametrize("yaw", np.linspace(-math.pi, math.pi, 17))
-def test_what_lies_across_the_blind_sector_is_seen_at_both_ends(yaw):
+def test_what_lies_across_the_blind_sector_is_seen_at_both_ends():
     around = ScanPlane([SQUARE * [1, 40]])  # spans more than the blind sector when behind
-    for scanner in (LASER, WIDE, replace(WIDE, start=-7.0)):
-        assert compare(scanner, around, (0.0, 0.0, yaw)) < 8
+    for yaw in np.linspace(-math.pi, math.pi, 17):
+        for scanner in (LASER, WIDE, replace(WIDE, start=-7.0)):
+            assert compare(scanner, around, (0.0, 0.0, yaw)) < 8
 
 
-@pytest.mark.parametrize("distance", [1e-4, 0.01, 0.3, 29.99, 31.0])
-def test_a_wall_close_by_and_one_at_the_range_s_end(distance):
-    for yaw in (0.0, 0.4, math.pi / 2, 3.0):
+def test_a_wall_close_by_and_one_at_the_range_s_end():
+    for distance in (1e-4, 0.01, 0.3, 29.99, 31.0):
         wall = ScanPlane(np.empty((0, 4, 2)), walls=[[[distance, -60], [distance, 60]]])
-        compare(LASER, wall, (0.0, 0.0, yaw))
+        for yaw in (0.0, 0.4, math.pi / 2, 3.0):
+            compare(LASER, wall, (0.0, 0.0, yaw))
 
 
 def test_no_beam_slips_through_the_joints_of_a_closed_room():
     outline = regular_polygon(900, radius=9.0)
     walls = np.stack([outline, np.roll(outline, -1, 0)], 1)
     plane = ScanPlane(np.empty((0, 4, 2)), walls=walls)
-    poses = np.random.default_rng(0).uniform((-6, -6, -4), (6, 6, 4), (400, 3))
+    poses = np.random.default_rng(0).uniform((-6, -6, -4), (6, 6, 4), (200, 3))
     assert np.isfinite(LASER.scan(plane, poses)).all()
 
 
@@ -133,7 +126,7 @@ def test_a_face_seen_end_on_is_not_seen():
 
 def test_a_sliver_seen_end_on_does_not_cover_the_lens():
     rng = np.random.default_rng(6)
-    for x, thickness in zip(rng.uniform(1, 29, 200), 10 ** rng.uniform(-5.9, -3, 200), strict=True):
+    for x, thickness in zip(rng.uniform(1, 29, 50), 10 ** rng.uniform(-5.9, -3, 50), strict=True):
         sliver = ScanPlane([[[x, 0], [x + 4, 0], [x + 4, thickness], [x, thickness]]])
         assert LASER.scan(sliver, (0, rng.choice([0.0, thickness]), 0)).all()
 
@@ -171,7 +164,7 @@ def test_changing_one_footprint_is_as_building_anew():
     rng = np.random.default_rng(5)
     plane = random_plane(rng, 150, 5, 60.0)
     corners, n_corners = plane.footprints
-    for step in range(400):
+    for step in range(200):
         i = int(rng.integers(150))
         k = int(rng.choice([0, 3, 4, 8, 12]))
         new = np.empty((0, 2))
@@ -215,8 +208,7 @@ def test_noise_has_the_spread_and_the_losses_that_were_asked_for():
     assert abs(np.corrcoef(filled[:, :-1].ravel(), filled[:, 1:].ravel())[0, 1]) < 0.01
     assert abs(np.corrcoef(filled[:-1].ravel(), filled[1:].ravel())[0, 1]) < 0.01
 
-
-def test_noisy_ranges_stay_between_zero_and_the_maximum():
+    # Ranges stay between zero and the maximum.
     plane = ScanPlane([SQUARE], walls=[[[-29.9, -90], [-29.9, 90]]])
     noisy = replace(WIDE, noise_sd=5.0, dropout=0.0).scan(plane, np.zeros((50, 3)), np.random.default_rng(0))
     finite = noisy[np.isfinite(noisy)]
@@ -241,10 +233,8 @@ def test_equal_seeds_give_equal_scans_on_any_number_of_threads():
     [
         (lambda: ScanPlane([SQUARE * np.nan]), r"footprints\[0, 0, 0\] is nan, want a finite number"),
         (lambda: ScanPlane([SQUARE * [0, 1]]), r"footprints\[0\] .*want "),
-        (lambda: ScanPlane([SQUARE, SQUARE * [1, 0]]), r"footprints\[1\] .*want "),
         (lambda: ScanPlane([[[0, 0], [1, 1], [2, 2]]]), r"footprints\[0\] .*want an area above zero"),
         (lambda: ScanPlane([[[0, 0], [4, 0], [1, 1], [0, 4]]]), r"footprints\[0\] .*want a convex outline"),
-        (lambda: ScanPlane([regular_polygon(5)[[0, 2, 4, 1, 3]]]), r"footprints\[0\] .*want a convex"),
         (lambda: ScanPlane([SQUARE], [2]), r"n_corners\[0\] .*want 3 to 4"),
         (lambda: ScanPlane([SQUARE], [4, 4]), r"n_corners .*want \(1,\) integers"),
         (lambda: ScanPlane([SQUARE], ids=[-3]), "ids is -3, want 0 or more"),
@@ -255,14 +245,11 @@ def test_equal_seeds_give_equal_scans_on_any_number_of_threads():
         (lambda: ScanPlane([SQUARE]).replace(0, regular_polygon(9)), "corners has 9 rows, want at most 4"),
         (lambda: LASER.scan(ScanPlane([SQUARE]), (0, math.nan, 0)), r"poses\[1\] is nan, want a finite"),
         (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0)), r"poses has shape \(2,\), want \(3\)"),
-        (lambda: LASER.scan(ScanPlane([SQUARE]), [(0, 0, math.inf)]), r"poses\[0, 2\] is inf, want a finite"),
         (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0, 0), exclude=1.5), "exclude .*want an id"),
         (lambda: LaserScanner(n_beams=0), "n_beams is 0, want an integer of 1 or more"),
-        (lambda: LaserScanner(step=0.1), "step .*want above 0 and 1081 beams within one turn"),
-        (lambda: LaserScanner(start=math.nan), "start is nan, want a finite number"),
-        (lambda: LaserScanner(max_range=-1.0), "max_range is -1.0, want above 0 m"),
-        (lambda: LaserScanner(noise_sd=-0.1), "noise_sd is -0.1, want 0 m or more"),
-        (lambda: LaserScanner(dropout=1.1), "dropout is 1.1, want 0 to 1"),
+        (lambda: LaserScanner(step=0.1), "step .*want 1081 beams within one turn"),
+        (lambda: LaserScanner(noise_sd=-0.1), "noise_sd is -0.1, want a finite number, at least 0"),
+        (lambda: LaserScanner(dropout=1.1), "dropout is 1.1, want a finite number, at least 0, at most 1"),
     ],
 )
 def test_bad_input_is_named(make, message):

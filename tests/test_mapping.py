@@ -6,7 +6,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -69,7 +68,7 @@ def drive_by(lot, scene, noise=None, slots=None):
     return slots
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_beams_tell_taken_slots_from_free_ones(mini, seed):
     rng = np.random.default_rng(seed)
     taken = rng.random(mini.n_slots) < 0.5
@@ -78,13 +77,15 @@ def test_beams_tell_taken_slots_from_free_ones(mini, seed):
     np.testing.assert_array_equal(states.occupied, taken)
 
 
-def test_people_and_traffic_are_not_parked_cars(mini):
+def test_people_and_traffic_are_not_parked_cars_nor_are_those_that_left_during_the_drive(mini):
+    full = drive_by(mini, slot_lot(mini).scene(np.ones(mini.n_slots, bool)))
     scene = slot_lot(mini).scene(np.zeros(mini.n_slots, bool))
     people = np.column_stack([mini.slot_xy, np.zeros(mini.n_slots)])
     still = np.zeros(mini.n_slots)
     driving = np.array([[mini.slot_xy[0, 0] + 6.0, 0.0, 0.0]])
     busy = scene.with_movers(Movers(driving, np.array([2]), people, still, still.astype(int)))
     assert not drive_by(mini, busy).states().occupied.any()
+    assert not drive_by(mini, scene, slots=full).states().occupied.any()
 
 
 def test_a_slot_that_nobody_saw_stays_unknown(mini):
@@ -105,12 +106,6 @@ def test_a_detection_goes_to_its_slot_and_one_elsewhere_to_none(mini):
     states = slots.states()
     assert states.occupied.tolist() == [i == 3 for i in range(mini.n_slots)]
     assert states.p_occupied[3] == pytest.approx(P_OCCUPIED)
-
-
-def test_a_car_that_leaves_during_the_drive_is_noticed(mini):
-    full, empty = (slot_lot(mini).scene(np.full(mini.n_slots, taken)) for taken in (True, False))
-    slots = drive_by(mini, empty, slots=drive_by(mini, full))
-    assert not slots.states().occupied.any()
 
 
 @pytest.mark.parametrize(
@@ -150,16 +145,13 @@ def test_predictions_come_from_the_asked_hour_and_kind_of_day():
     assert weekend.p_occupied[0] < 0.5 < weekend.p_occupied[1]
 
 
-def test_few_sessions_are_unsure_and_many_are_sharp():
+def test_few_sessions_are_unsure_many_are_sharp_and_a_slot_that_was_never_seen_is_like_its_lot():
     one, many = sessions([0.0], [[1, 0]]), sessions(np.zeros(60), [[1, 0]] * 60)
     a, b = predict(one), predict(many)
     assert (a.low <= a.p_occupied).all()
     assert (a.p_occupied <= a.high).all()
     assert ((b.high - b.low) < 0.3 * (a.high - a.low)).all()
     assert b.p_occupied[0] > 0.9 > 0.7 > a.p_occupied[0]
-
-
-def test_a_slot_that_was_never_seen_is_like_its_lot():
     known = np.ones((20, 3), bool)
     known[:, 2] = False
     log = sessions(np.zeros(20), [[1, 1, 0]] * 20, known)
@@ -239,11 +231,9 @@ def test_files_that_are_no_maps_are_refused(mini, tmp_path):
     ("change", "message"),
     [
         (lambda row: row["p_occupied"].pop(), r"has \(9,\) slots, want \(10,\)"),
-        (lambda row: row["p_occupied"].append("often"), "could not convert"),
         (lambda row: row.update(p_occupied=[7.0] * 10), "want .n_slots,. from 0 to 1"),
         (lambda row: row.update(time="noon"), "must be real number"),
         (lambda row: row.update(time=9e999), "time of session 'a' is inf"),
-        (lambda row: row.update(cars=[["west", 0.0, 0.0]]), "could not convert"),
         (lambda row: row.update(cars=[[1e300, 0.0, 0.0]]), "want .n, 3. of finite numbers, at most 1e"),
         (lambda row: row.pop("rig") and None, "rig"),
     ],
@@ -308,28 +298,20 @@ with MapStore(Path(sys.argv[1]), lot) as store:
 """
 
 
-def test_two_processes_write_at_once(mini, tmp_path):
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+def test_two_processes_write_at_once_and_a_kill_leaves_whole_sessions_only(mini, tmp_path):
     file = tmp_path / "m.sqlite"
     words = [sys.executable, "-c", _WRITER, file]
-    work = [subprocess.Popen([*words, name, "15"], stdout=subprocess.PIPE) for name in "ab"]
-    assert [w.wait(60) for w in work] == [0, 0]
-    with MapStore(file, mini, create=False) as store:
-        assert len(store.sessions()) == 30
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-def test_a_kill_leaves_whole_sessions_only(mini, tmp_path):
-    file = tmp_path / "m.sqlite"
-    words = [sys.executable, "-c", _WRITER, file, "a", "5000"]
-    writer = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    both = [subprocess.Popen([*words, name, "15"], stdout=subprocess.PIPE) for name in "ab"]
+    assert [writer.wait(60) for writer in both] == [0, 0]
+    killed = subprocess.Popen([*words, "c", "5000"], stdout=subprocess.PIPE, text=True)
     for _ in range(5):
-        writer.stdout.readline()
-    time.sleep(0.01)
-    os.kill(writer.pid, signal.SIGKILL)
-    writer.wait(30)
+        killed.stdout.readline()
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.wait(30)
     with MapStore(file, mini, create=False) as store:
         there = store.sessions()
-    assert len(there) >= 5
+    assert len(there) >= 35
     assert all(len(session.cars) == 50 and np.isfinite(session.p_occupied).all() for session in there)
 
 
@@ -339,10 +321,9 @@ def test_slots_are_found_where_cars_stand_again_and_again():
     seen = []
     for _ in range(20):
         taken = np.flatnonzero(rng.random(lot.n_slots) < 0.6)
-        turned = (
-            lot.slot_yaw[taken] + rng.normal(0, 0.05, len(taken)) + np.pi * rng.integers(0, 2, len(taken))
-        )
-        seen.append(np.column_stack([lot.slot_xy[taken] + rng.normal(0, 0.2, (len(taken), 2)), turned]))
+        n = len(taken)
+        turned = lot.slot_yaw[taken] + rng.normal(0, 0.05, n) + np.pi * rng.integers(0, 2, n)
+        seen.append(np.column_stack([lot.slot_xy[taken] + rng.normal(0, 0.2, (n, 2)), turned]))
     passing = np.column_stack([rng.uniform(0, 100, (30, 2)), rng.uniform(0, 3, 30)])
     found = discover(np.concatenate([*seen, passing]))
     score = score_discovery(found, lot)
@@ -371,7 +352,7 @@ def test_half_a_metre_of_pose_error_is_borne_and_two_are_not(mini):
 
     def accuracy(position):
         right = []
-        for seed in range(6):
+        for seed in range(4):
             rng = np.random.default_rng(seed)
             slots = SlotFilter(mini)
             xs = np.arange(mini.vertex_xy[:, 0].min(), mini.vertex_xy[:, 0].max(), 1.0)

@@ -71,9 +71,15 @@ def test_exact_boxes_of_usual_cars_give_the_exact_distance(ahead, aside, view, h
     assert 0.0 < std[0] < 0.3 * ahead + 1.0
 
 
-@pytest.mark.parametrize("detector", [DetectorErrors(), HogDetector.errors])
-@pytest.mark.parametrize("view", [0, 1, 2])
-@pytest.mark.parametrize("ahead", [5.0, 11.0])
+@pytest.mark.parametrize(
+    ("detector", "view", "ahead"),
+    [
+        (DetectorErrors(), 0, 5.0),
+        (HogDetector.errors, 1, 5.0),
+        (DetectorErrors(), 2, 11.0),
+        (HogDetector.errors, 0, 11.0),
+    ],
+)
 def test_the_stated_deviation_is_that_of_the_error(detector, view, ahead):
     """Boxes, pitch, and cars as uncertain as stated: as many errors within 1 and 2 deviations as of a normal one."""
     rng, n = np.random.default_rng(0), 400
@@ -92,8 +98,7 @@ def test_the_stated_deviation_is_that_of_the_error(detector, view, ahead):
     assert (off < 2.0).mean() > 0.9
 
 
-@pytest.mark.parametrize("detector", [DetectorErrors(), HogDetector.errors])
-@pytest.mark.parametrize("pitch", [-4.0, 0.0, 4.0])
+@pytest.mark.parametrize(("detector", "pitch"), [(DetectorErrors(), -4.0), (HogDetector.errors, 4.0)])
 def test_boxes_that_end_above_the_horizon_are_no_cars(detector, pitch):
     """However probable, and as high and wide as a car: the ground is elsewhere."""
     ground, tall = view_of(pitch=pitch), 250.0
@@ -183,7 +188,6 @@ BOMB = f'<!DOCTYPE gpx [<!ENTITY a "aaaaaaaaaa">{ENTITIES}]><gpx>&j;</gpx>'
     ("name", "text", "names"),
     [
         ("t.gpx", BOMB, "document type 'gpx'"),
-        ("t.gpx", '<!DOCTYPE x SYSTEM "file:///etc/passwd"><gpx/>', "document type 'x'"),
         ("t.gpx", "<gpx><trk>", "not XML"),
         ("t.gpx", "<gpx>" + " " * 17_000_000 + "</gpx>", "16,000,000 bytes"),
         ("t.gpx", "<osm/>", "root is <osm>"),
@@ -271,11 +275,8 @@ def test_a_drive_is_mapped_from_its_photographs_and_from_a_film_with_a_track(tmp
     photos, begin = tmp_path / "photos", datetime.datetime(2026, 5, 4, 9, tzinfo=datetime.UTC)
     photos.mkdir()
     film = cv2.VideoWriter(str(tmp_path / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 4.0, (640, 480))
-    lonlat, points, rows = (
-        LocalFrame(7.85, 48.0).to_lonlat(drive.poses[:, :2]),
-        [],
-        [("file", "x", "y", "yaw")],
-    )
+    lonlat = LocalFrame(7.85, 48.0).to_lonlat(drive.poses[:, :2])
+    points, rows = [], [("file", "x", "y", "yaw")]
     for i, pose in enumerate(drive.poses.tolist()):
         image = np.ascontiguousarray(drive.capture(i)[1].images["right"].image[..., ::-1])
         cv2.imwrite(str(photos / f"{i:04d}.png"), image)

@@ -25,7 +25,7 @@ def depth_of(scene, camera, pose):
         return 1.0 / seen.inverse_depth
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_depth_agrees_with_a_ray_caster(seed):
     scene = random_boxes(seed)
     camera = plain_camera()

@@ -70,7 +70,7 @@ def test_the_shipped_side_model_scans_real_photographs(uiuc):
     images = [LabelledImage("car", c, np.array([[0.0, 0.0, 100.0, 40.0]])) for c in uiuc.positives]
     images += [LabelledImage("background", c, nothing) for c in uiuc.negatives]
     images += [LabelledImage("twice", cv2.resize(c, (200, 80)), nothing) for c in uiuc.negatives]
-    assert score_on(CarModel.load("side"), images, "multi").row["eer"] > 0.96
+    assert score_on(CarModel.load("side"), images, "multi")["eer"] > 0.96
 
 
 @needs_kitti

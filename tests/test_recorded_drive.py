@@ -197,7 +197,7 @@ def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_pa
         for k, picture in enumerate(pictures):
             capture = Capture(np.zeros(3), {"right": Frame(picture, *none, np.zeros((0, 0), int))}, {}, {})
             writer.add(TimedCapture(200_000.0 + k, capture), np.array([2.0 * k, 1.0, 0.1]))
-        writer.close(Head("key", 200_000.0, "camera", "rain"))
+        writer.close(Head(key="key", time=200_000.0, rig="camera", weather="rain"))
     monkeypatch.chdir(tmp_path)
     code = (Path(__file__).parents[1] / "docs/calibration.md").read_text().split("```py\n")[1].split("```")[0]
     exec(compile(code, "calibration.md", "exec"), {})

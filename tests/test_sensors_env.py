@@ -8,6 +8,8 @@ import numba
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
+from shapely import Polygon, STRtree, box, polygons
+from shapely.affinity import rotate, translate
 
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
@@ -69,7 +71,7 @@ def test_the_search_is_that_of_the_search_environment():
             break
 
 
-def test_captures_lie_on_the_edge_just_driven_and_end_at_the_stop():
+def test_captures_lie_on_the_edge_just_driven_end_at_the_stop_and_waiting_makes_one():
     env = make(scenario="campus", rig=LASER_ONLY, captures=4, every=1.0)
     env.reset(seed=0)
     lot = env.unwrapped.scenario.lot
@@ -94,9 +96,7 @@ def test_captures_lie_on_the_edge_just_driven_and_end_at_the_stop():
         counts.add(n)
         before = here
     assert len(counts) > 1
-
-
-def test_waiting_makes_one_capture_and_time_goes_on():
+    # Waiting makes one capture, and time goes on.
     env = make(rig=LASER_ONLY)
     start, _ = env.reset(seed=0)
     missing = int(np.flatnonzero(start["action_mask"] == 0)[0])
@@ -187,18 +187,13 @@ def test_scenes_follow_the_world_and_do_not_depend_on_when_one_looks():
     assert len(cars) > 2 * lot.n_slots  # another car comes after one has left
 
 
-@pytest.mark.parametrize("name", ["campus", "street", "mini"])
+@pytest.mark.parametrize("name", ["campus", "street"])
 def test_traffic_keeps_to_its_ways(name):
-    from shapely import STRtree, box, polygons
-    from shapely.affinity import rotate, translate
-
-    scenario = make_scenario(name)
-    traffic = LotTraffic(
-        scenario.lot, 0, Traffic(cars=6, pedestrians=0), np.uint64(3), slot_lot(scenario.lot)
-    )
-    slots = STRtree(polygons(scenario.lot.slot_corners()))
+    lot = make_scenario(name).lot
+    traffic = LotTraffic(lot, 0, Traffic(cars=6, pedestrians=0), np.uint64(3), slot_lot(lot))
+    slots = STRtree(polygons(lot.slot_corners()))
     touching = 0
-    times = np.arange(0.0, 200.0, 2.0)
+    times = np.arange(0.0, 120.0, 2.0)
     before = None
     for time in times:
         pose = traffic.at(time).vehicle_pose
@@ -249,10 +244,8 @@ def test_all_road_users_are_where_each_would_be_alone(name, monkeypatch):
 
 
 def test_nobody_is_in_the_searching_cars_way():
-    scenario = make_scenario("mini")
-    traffic = LotTraffic(
-        scenario.lot, 0, Traffic(cars=3, pedestrians=4), np.uint64(1), slot_lot(scenario.lot)
-    )
+    lot = make_scenario("mini").lot
+    traffic = LotTraffic(lot, 0, Traffic(cars=3, pedestrians=4), np.uint64(1), slot_lot(lot))
     for time in np.arange(0.0, 60.0, 3.0):
         everyone = traffic.at(time)
         ego = everyone.vehicle_pose[0]
@@ -309,10 +302,6 @@ def test_moving_shadows_are_those_of_a_scene_made_anew():
         ({"vehicle_pose": [[0.0, np.nan, 0.0]], "vehicle_model": [0]}, r"vehicle_pose\[0, 1\]"),
         ({"vehicle_pose": [[0.0, 0.0, 0.0]]}, "vehicle_model .*want"),
         (
-            {"walker_pose": [[0.0, 0.0, 0.0]], "walker_look": [0]},
-            r"walker_stride has shape \(0,\), want \(1\)",
-        ),
-        (
             {"walker_pose": [[0.0] * 3], "walker_look": [99], "walker_stride": [0.0]},
             "walker_look .*want 0 to 11",
         ),
@@ -337,9 +326,11 @@ def test_samplers_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
         np.testing.assert_array_equal(a.capture.scans["laser"], b.capture.scans["laser"])
 
 
-@pytest.mark.parametrize("name", ["campus", "jam", "street", "mini"])
+@pytest.mark.parametrize("name", ["campus", "street", "mini"])
 def test_cars_of_a_full_lot_do_not_touch(name):
     lot = make_scenario(name).lot
     for arrival in (0, 7919):
-        scene = slot_lot(lot).scene(np.ones(lot.n_slots, bool), arrival)  # an overlap would warn
+        scene = slot_lot(lot).scene(np.ones(lot.n_slots, bool), arrival)
         assert len(scene.present) == lot.n_slots
+        cars = STRtree([Polygon(scene.footprint(i)) for i in scene.present])
+        assert cars.query(cars.geometries, predicate="intersects").shape[1] == lot.n_slots

@@ -251,7 +251,7 @@ class EvaluateDetector(Command):
         takes="NAME|FILE|MODULE:CLASS",
         default="none",
     )
-    out: Path = option(Path("results/detector"), "Folder for summary.json and figures.", short="-o")
+    out: Path = option(Path("results/detector"), "Folder for summary.json.", short="-o")
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -261,7 +261,6 @@ class EvaluateDetector(Command):
     def run(self) -> None:
         from parkenv.perception.car_datasets import read_crop_folder
         from parkenv.perception.detection_scores import recall_on_crops, score_on_uiuc
-        from parkenv.show.figures.survey import save_recall_precision
 
         detector, console = self._detector(), make_console()
         if self.crops is not None:
@@ -286,10 +285,8 @@ class EvaluateDetector(Command):
         elif self.uiuc is not None:
             make_folder(self.out)
             with stages(console, "images") as progress:
-                scores = score_on_uiuc(detector, self.uiuc, on_image=counted(progress, "Detecting"))
-            rows = [score.row for score in scores]
+                rows = score_on_uiuc(detector, self.uiuc, on_image=counted(progress, "Detecting"))
             print_rows(console, "UIUC", rows)
-            save_recall_precision(scores, self.detector or self.model, self.out / "recall_precision.png")
         save_summary(self.out, None, rows)
         console.print(f"Written: {self.out / 'summary.json'}")
 

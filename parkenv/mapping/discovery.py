@@ -39,14 +39,11 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
     once poses scatter by more than the gap between cars. Directions count as well, with a quarter turn equivalent to
     3 m; nose-in and nose-out are the same. A slot's position is the median of the cars within reach.
 
-    Args:
-        cars: (n, 3) x, y in m and yaw in rad, world frame, of all sessions.
-        reach: m, largest distance of cars in the same slot.
-        least: smallest number of cars that make a slot.
+    Cars, (n, 3) x, y in m and yaw in rad, are in the same slot up to `reach`, m; `least` of them make one.
 
     Examples:
-        >>> found = discover(np.array([[0.0, 0.1, 1.6], [0.1, 0.0, 4.7], [-0.1, 0.0, 1.5], [2.5, 0.0, 1.6]]))
-        >>> found.xy.round(1).tolist(), found.cars.tolist()
+        >>> slots = discover(np.array([[0.0, 0.1, 1.6], [0.1, 0.0, 4.7], [-0.1, 0.0, 1.5], [2.5, 0.0, 1.6]]))
+        >>> slots.xy.round(1).tolist(), slots.cars.tolist()
         ([[0.0, 0.0]], [3])
     """
     if cars.ndim != 2 or cars.shape[1] != 3 or not (np.abs(cars) <= FARTHEST).all():
@@ -94,35 +91,32 @@ def _density(tree: cKDTree, reach: float) -> tuple[FloatArray, NDArray[np.int64]
 
 
 def _inside(away: FloatArray, direction: float) -> NDArray[np.bool_]:
-    """Return which points, relative to a slot's centre, are too close to be another slot's centre."""
     c, s = math.cos(direction), math.sin(direction)
     along, across = c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]
     return np.asarray((np.abs(along) < _ROOM[0]) & (np.abs(across) < _ROOM[1]))
 
 
 def score_discovery(
-    found: FoundSlots, lot: ParkingLot, *, within: float = 1.0, turned: float = math.radians(15.0)
+    slots: FoundSlots, lot: ParkingLot, *, within: float = 1.0, turned: float = math.radians(15.0)
 ) -> DiscoveryScore:
     """Match discovered slots to the lot's slots one to one, nearest pairs first, and compute the errors.
 
     A match is at most `within` apart, m, and `turned`, rad.
     """
-    away = np.hypot(*(found.xy[:, None] - lot.slot_xy[None]).transpose(2, 0, 1))
-    turn = np.abs((found.yaw[:, None] - lot.slot_yaw[None] + math.pi / 2) % math.pi - math.pi / 2)
+    away = np.hypot(*(slots.xy[:, None] - lot.slot_xy[None]).transpose(2, 0, 1))
+    turn = np.abs((slots.yaw[:, None] - lot.slot_yaw[None] + math.pi / 2) % math.pi - math.pi / 2)
     pairs = np.argwhere((away <= within) & (turn <= turned))
     pairs = pairs[np.argsort(away[pairs[:, 0], pairs[:, 1]], kind="stable")]
-    left, right = set(range(len(found.xy))), set(range(lot.n_slots))
+    left, right = set(range(len(slots.xy))), set(range(lot.n_slots))
     chosen = []
     for a, b in pairs.tolist():
         if a in left and b in right:
             left.remove(a)
             right.remove(b)
             chosen.append((a, b))
-    rows, columns = (np.array(c, dtype=np.int64) for c in zip(*chosen, strict=True)) if chosen else (
-        np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    )  # fmt: skip
+    rows, columns = np.array(chosen, dtype=np.int64).reshape(-1, 2).T
     return DiscoveryScore(
-        len(chosen) / max(len(found.xy), 1),
+        len(chosen) / max(len(slots.xy), 1),
         len(chosen) / lot.n_slots,
         float(away[rows, columns].mean()) if chosen else math.nan,
         float(turn[rows, columns].mean()) if chosen else math.nan,

@@ -36,8 +36,6 @@ class MountSpec(Spec):
 
 
 class Lens(Spec):
-    """A camera: OpenCV's pinhole model."""
-
     width: Size
     height: Size
     fx: FocalLength

@@ -62,8 +62,7 @@ class OccupancyGrid:
         """Return the centre of each cell, (rows, columns, 2) float64, m, world frame."""
         rows, columns = self.log_odds.shape
         x = self.low[0] + self.cell * (np.arange(columns) + 0.5)
-        y = self.low[1] + self.cell * (np.arange(rows) + 0.5)
-        return np.stack(np.meshgrid(x, y), axis=2)
+        return np.stack(np.meshgrid(x, self.low[1] + self.cell * (np.arange(rows) + 0.5)), axis=2)
 
     def update(
         self,
@@ -108,11 +107,9 @@ class OccupancyGrid:
         )  # fmt: skip
 
     def _cells(self, x: float, y: float) -> tuple[float, float]:
-        """Return a position in units of cells."""
         return (x - self.low[0]) / self.cell, (y - self.low[1]) / self.cell
 
     def _add(self, window: tuple[int, int, int, int]) -> None:
-        """Add the evidence in `_marks` within a window of rows and columns, and clear it."""
         free, occupied = (math.log(p / (1.0 - p)) for p in (P_FREE, P_OCCUPIED))
         _add_evidence(self.log_odds, self.seen, self._marks, window, free, occupied, MOST_LOG_ODDS)
 

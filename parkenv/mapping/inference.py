@@ -30,8 +30,6 @@ _HOUR_WIDTH = 1.0
 
 @dataclass(frozen=True, eq=False)
 class SessionLog:
-    """The observed state of every slot in each session."""
-
     time: FloatArray  # (k,) s since Monday 00:00
     occupied: NDArray[np.bool_]  # (k, n_slots) bool
     known: NDArray[np.bool_]  # (k, n_slots) bool, whether the slot was observed
@@ -48,8 +46,6 @@ class SessionLog:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The map's prediction for every slot, (n_slots,) each."""
-
     p_occupied: FloatArray
     low: FloatArray  # and `high`: bounds of the credible interval of P(occupied)
     high: FloatArray
@@ -59,8 +55,7 @@ class Prediction:
 def counted(log: SessionLog) -> FloatArray:
     """Return the thesis's prediction, (n_slots,): N_occupied / (N_occupied + N_free), or 0.5 (eq. 3.10-3.12)."""
     seen = log.known.sum(axis=0)
-    taken = (log.occupied & log.known).sum(axis=0)
-    return np.where(seen > 0, taken / np.maximum(seen, 1), 0.5)
+    return np.where(seen > 0, (log.occupied & log.known).sum(axis=0) / np.maximum(seen, 1), 0.5)
 
 
 def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0.9) -> Prediction:
@@ -71,10 +66,7 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
     the lot's occupancy at this hour, the lot at this hour, the lot. So one session is enough for a first estimate, and
     more sessions refine it.
 
-    Args:
-        log: the sessions.
-        time: s since Monday 00:00; None: all sessions with equal weight.
-        confidence: probability of the credible interval.
+    The time is in s since Monday 00:00; None: all sessions with equal weight.
     """
     if not len(log.time):
         raise InputError("the map holds no session, want at least one")

@@ -20,12 +20,10 @@ from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_S
 
-MOST_SLOTS = 3_000
-"""Largest lot: memory and time grow with the square of the slots."""
+MOST_SLOTS = 3_000  # largest lot: memory and time grow with the square of the slots
 MOST_SURVEYED_SLOTS = 1_000
 """Largest lot whose survey sessions, which observe every slot, are learned from; that takes a second a session."""
-SURVEY_ERROR = 0.03
-"""Share of the slots that a survey session judges wrong."""
+SURVEY_ERROR = 0.03  # share of the slots that a survey session judges wrong
 USUAL_DAY = DayError(0.8)
 """Day error of a map that states none: the median of 99 car parks over two years is 0.77 logits."""
 _MEMORY = (30.0, 365.0)  # days, time constants of the drift
@@ -44,20 +42,14 @@ def _priors(
     )
 
 
-GIVEN_MAP = (
-    *_priors({0.1: 0.3, 0.5: 0.3, 1.0: 0.25, 2.5: 0.15}),
-    *_priors({2.0: 0.002}, trust=0.0),
-)
+GIVEN_MAP = (*_priors({0.1: 0.3, 0.5: 0.3, 1.0: 0.25, 2.5: 0.15}), *_priors({2.0: 0.002}, trust=0.0))
 """Priors for a given map: right, a little off, quite wrong, or worthless; with or without drift over weeks."""
-NO_MAP = _priors({1.0: 0.5, 2.0: 0.5})
-"""Priors for a lot of which nothing is known."""
+NO_MAP = _priors({1.0: 0.5, 2.0: 0.5})  # priors for a lot of which nothing is known
 SURVEYED = _priors({1.0: 0.5, 2.0: 0.5}, shape={**_SHAPE, "hour": 1.0})
 """Priors for a lot of which survey sessions alone are known; unlike a driver's trips, they are spread over the day."""
 
 
 class EmptyMap(PriorModel):
-    """The map of a lot of which nothing is known: 50 % for every slot."""
-
     def __init__(self, n_slots: int) -> None:
         self._forecast = Forecast(np.full(n_slots, 0.5), np.full(n_slots, 1.0 / RELAXATION_S), USUAL_DAY)
 
@@ -152,7 +144,6 @@ class LearnedMap(PriorModel):
         self._day = day if self._day is None else max(day, self._day)
 
     def learn(self, trips: Sequence[Trip]) -> None:
-        """Add trips, ordered by time and not before those already added."""
         for day, trips_of_day in groupby(trips, key=lambda trip: int(trip.time // DAY_S)):
             self.pass_time(day)
             self._add_day(list(trips_of_day))
@@ -206,7 +197,6 @@ class LearnedMap(PriorModel):
         self._error.observe(evidence, logits, (day_error.level, day_error.slope))
 
     def _day_error(self, day: DayError, weights: FloatArray, logits: FloatArray, hour: float) -> DayError:
-        """Return the day's own error together with the uncertainty of what all slots share."""
         level_sd, slope_sd = self._error.common_sd(hour)
         rise = self._nearness / max(float(self._nearness @ self._nearness), 1e-12)
         both = []

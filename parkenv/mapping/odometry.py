@@ -10,8 +10,7 @@ import numpy as np
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, require_number
 
-DRIFT_M = 100.0
-"""Distance straight ahead, m, after which the error of drifting odometry is stated."""
+DRIFT_M = 100.0  # distance straight ahead, m, after which the error of drifting odometry is stated
 MOST_DRIFT = 0.5
 
 

@@ -25,8 +25,7 @@ from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.perception.monocular import RangingErrors
 from sim_sensors.camera.models import PinholeCamera
 
-POSES = "poses.csv"
-"""The poses beside the pictures, if no others are named."""
+POSES = "poses.csv"  # the poses beside the pictures, if no others are named
 _POSE = "geometry_msgs/msg/Pose2D"
 _GNSS_M, _TRACK_YAW = 3.0, math.radians(3.0)
 
@@ -38,8 +37,6 @@ def is_photographs(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class _File:
-    """A message with a picture that is read when it is wanted."""
-
     path: Path
     format: str = "file"
 
@@ -51,16 +48,8 @@ class _File:
 class Photographs:
     """A folder of photographs or a film, with poses.
 
-    Args:
-        path: the folder or the film.
-        options: where the poses are, and what the camera is.
-        calibration: of one camera; None for `options.fov`.
-        frame: of the lot, where its file has degrees.
-
-    Attributes:
-        calibration: the camera, with a topic for the pictures.
-        errors: of the poses.
-        without_pose: number of photographs that the table of poses does not name.
+    `calibration` is of one camera, None for `options.fov`, `frame` that of a lot whose file has degrees, `errors` those
+    of the poses. The table of poses does not name `without_pose` of the photographs.
     """
 
     def __init__(
@@ -99,7 +88,6 @@ class Photographs:
 
     @contextmanager
     def open(self) -> Iterator[tuple[dict[str, str], Messages]]:
-        """Yield topics and messages, as `open_recording`."""
         pose, picture = self.calibration.pose, self.calibration.cameras[0].topic
 
         def messages(topics: set[str]) -> Iterator[tuple[str, int, Any]]:
@@ -151,15 +139,14 @@ class Photographs:
         return np.array(taken, np.int64)
 
     def _usual_camera(self) -> CameraSpec:
-        """Return a camera without distortion, with the field of view and mount of the options."""
         if self._options.fov is None:
             raise InputError(f"{self.path}: nothing says what the camera is; want --calibration or --fov")
         if self._film is None:
             height, width = read_image(self._files[0]).shape[:2]
         else:
             height, width = self._film.height, self._film.width
-        made = PinholeCamera.from_field_of_view(width, height, math.radians(self._options.fov))
-        numbers = {name: getattr(made, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        camera = PinholeCamera.from_field_of_view(width, height, math.radians(self._options.fov))
+        numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         mount = dict(zip(("z", "yaw", "pitch"), self._options.mount, strict=True))
         parsed = MountSpec.parse(mount, dict.fromkeys(mount, "--mount"))
         return CameraSpec(name="camera", mount=parsed, **numbers)

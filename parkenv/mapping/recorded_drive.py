@@ -12,11 +12,11 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,7 +35,8 @@ from parkenv.files.recordings import (
     require_rosbags,
     stamp_of,
 )
-from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, LaserSpec, Lens, StereoSpec
+from parkenv.files.spec_file import Spec
+from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, Lens, StereoSpec
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.photographs import Photographs
 from parkenv.mapping.store import Session
@@ -50,28 +51,22 @@ from sim_sensors.errors import SensorError
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, TimedCapture
 
-PAIR_S = 0.1
-"""Longest time between a picture and what other sensors measured with it, s."""
-GAP_S = 2.0
-"""Longest time between two poses that a pose is interpolated between, s."""
+PAIR_S = 0.1  # longest time between a picture and what other sensors measured with it, s
+GAP_S = 2.0  # longest time between two poses that a pose is interpolated between, s
 HEAD, POSE = "/parkenv/drive", "/pose"
 _MONDAY_S = 1_704_067_200  # 2024-01-01; drives are recorded as if in the week from this Monday on
 _STRING, _POSE_2D = "std_msgs/msg/String", "geometry_msgs/msg/Pose2D"
 _SCAN = "sensor_msgs/msg/LaserScan"
-_POSES = (
-    _POSE_2D, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry",
-)  # fmt: skip
+_TYPES = {
+    "pose": (_POSE_2D, *(f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "PoseWithCovarianceStamped")),
+             "nav_msgs/msg/Odometry"),
+    "image": (COMPRESSED_IMAGE, IMAGE),
+    "scan": (_SCAN,),
+}  # fmt: skip
 _NO_DEPTH, _NO_IDS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
 
 
-class _Stream(NamedTuple):
-    """One sensor's messages."""
-
-    topic: str
-    types: tuple[str, ...]
-
-
-class Head(NamedTuple):
+class Head(Spec, extra="ignore"):
     """What identifies a session: its key, start (s since Monday 00:00), rig and weather."""
 
     key: str
@@ -82,8 +77,6 @@ class Head(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MappedDrive:
-    """A recorded drive, mapped."""
-
     session: Session  # the record for the map file
     states: SlotStates  # the filter's final estimate
     grid: OccupancyGrid  # the occupancy grid
@@ -93,8 +86,6 @@ class MappedDrive:
 
 
 class DriveWriter:
-    """Writes a drive to an MCAP file; see `recording`."""
-
     def __init__(self, writer: Any, rig: SensorRig, store: Any) -> None:
         self._writer, self._rig, self._store, self._last = writer, rig, store, 0
         self._connections: dict[str, Any] = {}
@@ -119,8 +110,7 @@ class DriveWriter:
             )  # fmt: skip
 
     def close(self, head: Head) -> None:
-        """Append what identifies the session."""
-        self._send(HEAD, _STRING, self._last, data=json.dumps(head._asdict()))
+        self._send(HEAD, _STRING, self._last, data=json.dumps(head.model_dump()))
 
     def _send_image(self, topic: str, stamp: int, image: NDArray[np.uint8]) -> None:
         data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
@@ -151,14 +141,13 @@ def recording(path: Path, rig: SensorRig) -> Iterator[DriveWriter]:
         try:
             with Writer(folder / "drive", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 yield DriveWriter(writer, rig, get_typestore(Stores.ROS2_HUMBLE))
-            (made,) = (folder / "drive").glob("*.mcap")
-            made.replace(beside)
+            (recording,) = (folder / "drive").glob("*.mcap")
+            recording.replace(beside)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
 
 def require_recordable(path: Path) -> None:
-    """Check that a drive can be written to a file, before any work."""
     require_rosbags()
     if path.suffix != ".mcap":
         raise InputError(f"{path}: want a name that ends in .mcap")
@@ -184,7 +173,7 @@ class RecordedDrive:
     pose_s: FloatArray = field(init=False)  # (n,) s, Unix time relative to `_start`
 
     def __post_init__(self) -> None:
-        self._streams: dict[str, _Stream] = {}
+        self._topics: dict[str, str] = {}  # by sensor: pose, image:NAME:SIDE, scan:NAME
         self._lenses: dict[str, Lens] = {}
         self._stamps: dict[str, list[int]] = {}
         self._scans: dict[str, list[NDArray[np.float32]]] = {}
@@ -194,11 +183,14 @@ class RecordedDrive:
             self.calibration = self.photographs.calibration
         with self._open() as (topics, messages):
             self._plan(topics)
-            wanted = {stream.topic: key for key, stream in self._streams.items()}
-            self._stamps = {key: [] for key in self._streams}
+            wanted = {topic: key for key, topic in self._topics.items()}
+            self._stamps = {key: [] for key in self._topics}
             for topic, stamp, message in messages({*wanted, HEAD}):
                 if topic == HEAD:
-                    self._take_head(message.data)
+                    content = parse_json(message.data, f"{self.path}: {HEAD}", finite=True)
+                    self.head = Head.parse(
+                        content if isinstance(content, dict) else {}, f"{self.path}: {HEAD}"
+                    )
                     continue
                 key = wanted[topic]
                 self._add_stamp(key, stamp_of(message, stamp))
@@ -210,12 +202,10 @@ class RecordedDrive:
 
     @property
     def key(self) -> str:
-        """The key of the session."""
         return self.head.key if self.head else f"{self.path.name}/{self._stamps['pose'][0]}"
 
     @property
     def start(self) -> float:
-        """Start of the session, s since Monday 00:00."""
         if self.head is not None:
             return self.head.time
         zone = self.calibration.timezone_h * 3600.0 if self.calibration else 0.0
@@ -229,11 +219,7 @@ class RecordedDrive:
         )
 
     def captures(self, every: float = 0.0) -> Iterator[tuple[TimedCapture, FloatArray]]:
-        """Yield the captures, and the vehicle's pose of each, (3,) x, y in m and yaw in rad.
-
-        Args:
-            every: m, least distance between the poses of captures.
-        """
+        """Yield captures at least `every` m apart, and the vehicle's pose of each, (3,) x, y in m and yaw in rad."""
         plan = self._frames(every)
         needed: dict[tuple[str, int], list[int]] = {}
         for k, (_, partners, _) in enumerate(plan):
@@ -241,8 +227,8 @@ class RecordedDrive:
                 if not key.startswith("scan:"):
                     needed.setdefault((key, index), []).append(k)
         images: list[dict[str, NDArray[np.uint8]]] = [{} for _ in plan]
-        count = dict.fromkeys(self._streams, -1)
-        cameras = {s.topic: key for key, s in self._streams.items() if key.startswith("image:")}
+        count = dict.fromkeys(self._topics, -1)
+        cameras = {topic: key for key, topic in self._topics.items() if key.startswith("image:")}
         done = 0
         with self._open() as (_, messages):
             for topic, _, message in messages(set(cameras)):
@@ -259,63 +245,46 @@ class RecordedDrive:
         return open_recording(self.path) if self.photographs is None else self.photographs.open()
 
     def _plan(self, topics: dict[str, str]) -> None:
-        """Set the streams: from the calibration, or those of `recording`."""
-        image, pose = (COMPRESSED_IMAGE, IMAGE), self.calibration.pose if self.calibration else POSE
-        self._streams = {"pose": _Stream(pose, _POSES)}
-        sensors: Sequence[CameraSpec | StereoSpec | LaserSpec]
-        if self.calibration is None:
-            if HEAD not in topics:
-                raise InputError(
-                    f"{self.path}: was not made by parkenv survey --record; describe its sensors: --calibration"
-                )
+        self._topics = {"pose": self.calibration.pose if self.calibration else POSE}
+        if self.calibration is not None:
+            cameras: list[tuple[CameraSpec | StereoSpec, str, str]]
+            cameras = [(camera, "mono", camera.topic) for camera in self.calibration.cameras]
+            for pair in self.calibration.stereo_cameras:
+                cameras += [(pair, "left", pair.left), (pair, "right", pair.right)]
+            self._lenses = {f"image:{camera.name}:{side}": camera for camera, side, _ in cameras}
+            self._topics |= {f"image:{camera.name}:{side}": topic for camera, side, topic in cameras}
+            self._topics |= {f"scan:{laser.name}": laser.topic for laser in self.calibration.lasers}
+        elif HEAD not in topics:
+            raise InputError(
+                f"{self.path}: was not made by parkenv survey --record; describe its sensors: --calibration"
+            )
+        else:
             for topic, kind in topics.items():
                 name, _, what = topic[1:].partition("/")
                 if kind == _SCAN:
-                    self._streams[f"scan:{name}"] = _Stream(topic, (_SCAN,))
+                    self._topics[f"scan:{name}"] = topic
                 elif kind == COMPRESSED_IMAGE:
                     side = what.partition("/")[0] if what.startswith(("left", "right")) else "mono"
-                    self._streams[f"image:{name}:{side}"] = _Stream(topic, image)
-        else:
-            sensors = (*self.calibration.cameras, *self.calibration.stereo_cameras, *self.calibration.lasers)
-            for sensor in sensors:
-                if isinstance(sensor, LaserSpec):
-                    self._streams[f"scan:{sensor.name}"] = _Stream(sensor.topic, (_SCAN,))
-                    continue
-                if isinstance(sensor, StereoSpec):
-                    sides = {"left": sensor.left, "right": sensor.right}
-                else:
-                    sides = {"mono": sensor.topic}
-                for side, topic in sides.items():
-                    self._streams[f"image:{sensor.name}:{side}"] = _Stream(topic, image)
-                    self._lenses[f"image:{sensor.name}:{side}"] = sensor
-        for key, stream in self._streams.items():
-            if topics.get(stream.topic) not in stream.types:
-                what = {"pose": "poses", "scan": "scans"}.get(key.partition(":")[0], "images")
+                    self._topics[f"image:{name}:{side}"] = topic
+        for key, topic in self._topics.items():
+            kind = key.partition(":")[0]
+            if topics.get(topic) not in _TYPES[kind]:
                 there = ", ".join(f"{t} ({kind})" for t, kind in sorted(topics.items())[:12]) or "nothing"
-                raise InputError(
-                    f"{self.path}: has no {what} in {stream.topic}, want {' or '.join(stream.types)}; it has {there}"
-                )
-
-    def _take_head(self, text: str) -> None:
-        content = parse_json(text, f"{self.path}: {HEAD}", finite=True)
-        head = content if isinstance(content, dict) else {}
-        kinds = {"key": str, "time": int | float, "rig": str, "weather": str}
-        if any(not isinstance(head.get(name), kind) for name, kind in kinds.items()):
-            raise InputError(f"{self.path}: {HEAD} is {text!r:.80}, want what parkenv survey --record wrote")
-        self.head = Head(head["key"], float(head["time"]), head["rig"], head["weather"])
+                wanted = " or ".join(_TYPES[kind])
+                raise InputError(f"{self.path}: has no {kind}s in {topic}, want {wanted}; it has {there}")
 
     def _add_stamp(self, key: str, stamp: int) -> None:
         before = self._stamps[key]
         if before and stamp <= before[-1]:
             raise InputError(
-                f"{self.path}: {self._streams[key].topic}: time goes from {before[-1] / 1e9:.6f} to "
+                f"{self.path}: {self._topics[key]}: time goes from {before[-1] / 1e9:.6f} to "
                 f"{stamp / 1e9:.6f} s at message {len(before) + 1}, want it to rise"
             )
         before.append(stamp)
 
     def _add_scan(self, name: str, message: Any) -> None:
         ranges = np.array(message.ranges, dtype=np.float32)
-        where = f"{self.path}: {self._streams[f'scan:{name}'].topic}"
+        where = f"{self.path}: {self._topics[f'scan:{name}']}"
         if name not in self._scanners:
             try:
                 self._scanners[name] = LaserScanner(
@@ -338,7 +307,7 @@ class RecordedDrive:
         """Check that the streams have something in common, and make the rig."""
         spans = {}
         for key, stamps in self._stamps.items():
-            topic = self._streams[key].topic
+            topic = self._topics[key]
             if not stamps:
                 raise InputError(f"{self.path}: {topic} has no messages")
             spans[topic] = (stamps[0] / 1e9, stamps[-1] / 1e9)
@@ -351,9 +320,7 @@ class RecordedDrive:
             )
         if not np.isfinite(poses).all():
             bad = int(np.flatnonzero(~np.isfinite(poses).all(axis=1))[0])
-            raise InputError(
-                f"{self.path}: {self._streams['pose'].topic}: pose {bad + 1} is {poses[bad].tolist()}"
-            )
+            raise InputError(f"{self.path}: {self._topics['pose']}: pose {bad + 1} is {poses[bad].tolist()}")
         self.poses = poses
         if self.calibration is None:
             if self.head is None or self.head.rig not in RIG_NAMES:
@@ -375,16 +342,12 @@ class RecordedDrive:
         self.pose_s = (np.array(self._stamps["pose"], np.int64) - start) / 1e9
 
     def _require_rig(self) -> None:
-        """Check that a recording of our own has the sensors of its rig."""
         rig = self.rig
-        wanted = {f"image:{name}:mono" for name, _, _ in rig.cameras} | {
-            f"scan:{n}" for n, _, _ in rig.lasers
-        }
+        wanted = {f"scan:{name}" for name, _, _ in rig.lasers}
+        wanted |= {f"image:{name}:mono" for name, _, _ in rig.cameras}
         wanted |= {f"image:{name}:{side}" for name, _, _ in rig.stereo_cameras for side in ("left", "right")}
-        if missing := sorted(wanted - self._streams.keys()):
-            raise InputError(
-                f"{self.path}: has no {missing[0].replace(':', ' ')}, which its rig {self.head} has"
-            )
+        if missing := sorted(wanted - self._topics.keys()):
+            raise InputError(f"{self.path}: has no {missing[0].replace(':', ' ')}, which its rig has")
         for name, laser, _ in rig.lasers:
             if self._scanners[name].n_beams != laser.n_beams:
                 raise InputError(
@@ -406,14 +369,13 @@ class RecordedDrive:
             plan.append((stamp, nearest, pose))
         if not plan:
             raise InputError(
-                f"{self.path}: no picture of {self._streams[self._first].topic} has a pose and measurements of all "
+                f"{self.path}: no picture of {self._topics[self._first]} has a pose and measurements of all "
                 f"other sensors within {PAIR_S} s"
             )
         return plan
 
     @property
     def _first(self) -> str:
-        """The key of the first camera."""
         return next(key for key in self._stamps if key.startswith("image:"))
 
     def pose_at(self, stamp: int) -> FloatArray | None:
@@ -446,16 +408,12 @@ class RecordedDrive:
         return TimedCapture(self.start + (stamp - self._stamps["pose"][0]) / 1e9, capture), pose
 
     def _decoded(self, key: str, message: Any, index: int) -> NDArray[np.uint8]:
-        """Return an image, (h, w, 3) RGB, without distortion."""
-        where = f"{self.path}: {self._streams[key].topic}: image {index + 1}"
+        where = f"{self.path}: {self._topics[key]}: image {index + 1}"
         image = picture_in(message, where)
         image = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
-        name = key.split(":")[1]
-        camera = next(
-            c for n, c in (
-                *((n, c) for n, c, _ in self.rig.cameras), *((n, s.camera) for n, s, _ in self.rig.stereo_cameras),
-            ) if n == name
-        )  # fmt: skip
+        cameras = {name: camera for name, camera, _ in self.rig.cameras}
+        cameras |= {name: pair.camera for name, pair, _ in self.rig.stereo_cameras}
+        camera = cameras[key.split(":")[1]]
         if image.shape[:2] != (camera.height, camera.width):
             raise InputError(
                 f"{where} is {image.shape[1]}×{image.shape[0]} px, want {camera.width}×{camera.height} as calibrated"
@@ -474,15 +432,10 @@ def map_drive(
     on_frame: Callable[[], None] = lambda: None,
     localise: str = "none",
 ) -> MappedDrive:
-    """Run the perception pipeline and the mapping on a recorded drive.
+    """Run the perception pipeline and the mapping on a recorded drive, with captures at least `every` m apart.
 
-    Args:
-        drive: the recording.
-        lot: the lot with the slots.
-        detector: as in `make_detector`.
-        every: m, least distance between captures.
-        on_frame: called after every capture.
-        localise: what corrects the recorded poses: `none`, or `scan-matching`, for which they are drifting odometry.
+    What corrects the recorded poses is `none`, or `scan-matching`, for which they are drifting odometry. `on_frame` is
+    called after every capture.
     """
     if localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
         raise InputError(f"localise is {localise!r}, want none: {drive.path} has no laser nor stereo camera")
@@ -514,13 +467,12 @@ def _car_rows(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[s
 
 
 def record_drive(survey: Survey, number: int, path: Path) -> None:
-    """Drive a survey session, and write what its sensors measure to an MCAP file."""
     with recording(path, survey.pipeline.rig) as writer:
         driven = survey.drive(
             number, on_frame=lambda frame: writer.add(frame.result.captured, frame.odometry)
         )
         session = driven.session
-        writer.close(Head(session.key, session.time, session.rig, session.weather))
+        writer.close(Head(**{name: getattr(session, name) for name in ("key", "time", "rig", "weather")}))
 
 
 def _pose_of(message: Any) -> tuple[float, float, float]:
@@ -533,7 +485,6 @@ def _pose_of(message: Any) -> tuple[float, float, float]:
 
 
 def _nearest(stamps: IntArray, stamp: int) -> int:
-    """Return the index of the nearest stamp, the earlier one of two."""
     after = int(np.searchsorted(stamps, stamp))
     if after == len(stamps) or (after and stamp - stamps[after - 1] <= stamps[after] - stamp):
         return after - 1

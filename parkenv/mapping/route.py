@@ -17,8 +17,6 @@ _MILLIMETRES = 1000.0
 
 
 class SurveyRoute(NamedTuple):
-    """A closed drive."""
-
     vertices: NDArray[np.int64]  # (k,) int64, in driving order
     path: FloatArray  # (k, 2) float64, m, lot frame
     # number of slots passed against the direction of a one-way lane, because they are on its left
@@ -42,12 +40,7 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
     quiet hours. The required lanes are known, so this is the rural postman problem on a directed graph: a minimum-cost
     flow gives the cheapest extra sections that balance arrivals and departures at every junction, and an Eulerian
     circuit then drives them all (Christofides et al., "An algorithm for the rural postman problem on a directed
-    graph", 1986).
-
-    Args:
-        lot: the lot.
-        entry: index into `lot.entries`, start and end of the drive.
-        both_sides: whether a camera also points to the left.
+    graph", 1986). With `both_sides` a camera also points to the left.
     """
     passes = _passes(lot)
     # A section begins at each vertex of its junction from which cars may take it.
@@ -92,8 +85,7 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
 
 
 def _passes(lot: ParkingLot) -> list[_Pass]:
-    """Return all allowed sections from junction to junction."""
-    found = []
+    passes = []
     for junction in range(lot.n_slots, lot.n_vertices):
         for column in np.flatnonzero(lot.neighbors[junction] >= 0):
             stops, length = [junction], 0.0
@@ -103,12 +95,11 @@ def _passes(lot: ParkingLot) -> list[_Pass]:
                 stops.append(vertex)
                 vertex, step = _straight_on(lot, vertex)
                 length += step
-            found.append(_Pass(tuple(stops), length))
-    return found
+            passes.append(_Pass(tuple(stops), length))
+    return passes
 
 
 def _straight_on(lot: ParkingLot, vertex: int) -> tuple[int | None, float]:
-    """Return the next vertex along a slot's lane and its distance; None at a junction."""
     if vertex >= lot.n_slots:
         return None, 0.0
     heading = lot.vertex_yaw[vertex]
@@ -134,7 +125,6 @@ def _left_slots(lot: ParkingLot, way: _Pass) -> int:
 
 
 def _join(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any], start: int) -> None:
-    """Connect all required sections to the start by the shortest ways there and back."""
     drive.add_node(start)
     while True:
         parts = list(nx.weakly_connected_components(drive))
@@ -145,8 +135,7 @@ def _join(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any], start: int) -> Non
         away = [v for part in parts if part is not home for v in part if v in out[0]]
         if not away:
             raise nx.NetworkXNoPath
-        nearest = min(away, key=lambda v: (out[0][v], v))
-        _drive_along(drive, ways, out[1][nearest])
+        _drive_along(drive, ways, out[1][min(away, key=lambda v: (out[0][v], v))])
 
 
 def _balance(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any]) -> None:

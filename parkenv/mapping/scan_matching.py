@@ -169,7 +169,6 @@ def _fitted(
 
 
 def _to_points(ends: FloatArray, submap: FloatArray, tree: cKDTree | None) -> _Fit:
-    """Fit points to the lines through their neighbours among earlier points."""
     if tree is None:
         return _Fit(np.empty(0, np.int64), np.empty(0), np.empty((0, 2)), np.empty(0))
     distance, index = map(np.asarray, tree.query(ends, k=NEIGHBORS, distance_upper_bound=POINT_GATE))
@@ -190,13 +189,10 @@ def _to_points(ends: FloatArray, submap: FloatArray, tree: cKDTree | None) -> _F
 
 
 def _robust(residual: FloatArray, sd: FloatArray | float) -> FloatArray:
-    """Return the weights of Geman and McClure's estimator: small beyond two standard deviations."""
     return np.asarray((1.0 + (residual / (2.0 * sd)) ** 2) ** -2)
 
 
 class _Edges(NamedTuple):
-    """Line segments of the lot; walls have no outside, `normal` of outlines of cars points outward."""
-
     start: FloatArray  # (n, 2) m
     along: FloatArray  # (n, 2) unit vectors
     normal: FloatArray  # (n, 2) unit vectors
@@ -206,7 +202,6 @@ class _Edges(NamedTuple):
 
 
 def _lot_edges(lot: ParkingLot) -> _Edges:
-    """Return walls, and outlines of cars of usual size in the middle of their slots."""
     kerbside = lot.slot_mouth != Mouth.REAR
     length = np.where(kerbside, np.minimum(USUAL_CAR[0], lot.slot_length), USUAL_CAR[0])
     half = 0.5 * np.column_stack([length, np.minimum(USUAL_CAR[1], lot.slot_width)])
@@ -243,7 +238,6 @@ def _near_edges(edges: _Edges, pose: FloatArray) -> _Edges:
 
 
 def _to_edges(ends: FloatArray, pose: FloatArray, edges: _Edges) -> _Fit:
-    """Fit points to the edges of the lot that face the vehicle."""
     edge, residual = _matched_edges(ends, pose[0], pose[1], *edges)
     points = np.flatnonzero(edge >= 0)
     edge, residual = edge[points], residual[points]
@@ -305,6 +299,5 @@ def _placed(points: FloatArray, pose: FloatArray) -> FloatArray:
 
 
 def _rotation(angle: float) -> FloatArray:
-    """Return the matrix, (3, 3), that turns x and y of a pose's error."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -19,8 +19,7 @@ from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.trips import Trip
 from parkenv.world.lot import FARTHEST, ParkingLot
 
-MAX_STATES = 50_000_000
-"""Maximum number of sessions times slots, and of observations of trips, that are read."""
+MAX_STATES = 50_000_000  # maximum number of sessions times slots, and of observations of trips, that are read
 _OBSERVED = ("slots", "after_s", "taken", "hit_rate", "false_alarm_rate")
 
 
@@ -74,7 +73,10 @@ class MapStore:
 
     def __init__(self, path: Path, lot: ParkingLot, *, create: bool = True) -> None:
         self.path, self._lot = path, lot
-        about = {"lot": lot.name, "digest": lot_digest(lot)}
+        poses = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
+        # Adding 0 turns -0.0 into 0.0.
+        digest = hashlib.sha256((np.round(poses, 3) + 0.0).tobytes()).hexdigest()[:16]
+        about = {"lot": lot.name, "digest": digest}
         self._file = RowFile(path, "map file", "parkenv survey", create=create, about=about)
         head = self._file.head
         if head.get("digest") != about["digest"]:
@@ -181,10 +183,3 @@ class MapStore:
             yield
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{self.path}: {key!r:.40}: {error}") from error
-
-
-def lot_digest(lot: ParkingLot) -> str:
-    """Return a hash of the lot's slot poses."""
-    poses = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
-    # Adding 0 turns -0.0 into 0.0.
-    return hashlib.sha256((np.round(poses, 3) + 0.0).tobytes()).hexdigest()[:16]

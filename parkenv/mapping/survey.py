@@ -91,7 +91,6 @@ class SessionResult:
 
     @property
     def slot_accuracy_seen(self) -> float:
-        """Fraction of the slots with evidence whose state is correct."""
         seen = self.states.in_view
         return float((self.states.occupied == self.truth)[seen].mean()) if seen.any() else float("nan")
 
@@ -149,8 +148,7 @@ class Survey:
         """
         scenario, settings = self.scenario, self.settings
         key = world_key(settings.seed, number)
-        window = settings.windows[number % len(settings.windows)]
-        arrival = scenario.occupancy.draw_arrival(window, key)
+        arrival = scenario.occupancy.draw_arrival(settings.windows[number % len(settings.windows)], key)
         world = scenario.occupancy.world(key, arrival)
         rng = np.random.default_rng([int(key), 1])
         preset = settings.weather or str(rng.choice(PRESETS))
@@ -238,7 +236,6 @@ class SessionMap:
         self.cars: list[FloatArray] = []
 
     def add(self, captured: TimedCapture, odometry: FloatArray) -> PerceptionResult:
-        """Process a capture at a pose of the odometry, (3,)."""
         result = self._pipeline.process(captured, self.slots, self._locate(odometry))
         for view in result.views:
             _update_grid(self.grid, view, result.vehicle)
@@ -252,10 +249,8 @@ class SessionMap:
 
 
 def _update_grid(grid: OccupancyGrid, view: CameraView, vehicle: FloatArray) -> None:
-    """Update a grid by the cars that one camera sees from a vehicle at (3,) x, y, yaw."""
     x, y, yaw = view.mount.in_world(vehicle)
     away = view.cars.xy - np.array([x, y])
     bearing = np.arctan2(away[:, 1], away[:, 0]) - yaw
     polar = np.column_stack([(bearing + np.pi) % (2 * np.pi) - np.pi, view.cars.distance])
-    half_angle = float(np.arctan(view.camera.width / view.camera.fx / 2.0))
-    grid.update((x, y), yaw, half_angle, polar)
+    grid.update((x, y), yaw, float(np.arctan(view.camera.width / view.camera.fx / 2.0)), polar)

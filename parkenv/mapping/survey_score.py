@@ -25,8 +25,7 @@ _GLIMPSE = 0.05  # visible fraction from which a box can match a car
 _TRUTH = LaserScanner()
 _LEAST_BEAMS = 3
 
-TrueBoxes = dict[str, VehicleBoxes]
-"""The vehicles in the image of each camera, by its name."""
+TrueBoxes = dict[str, VehicleBoxes]  # the vehicles in the image of each camera, by its name
 
 
 def true_boxes(rig: SensorRig, scene: Scene, capture: Capture) -> TrueBoxes:
@@ -73,11 +72,7 @@ class SurveyScore:
         return float((off <= 1.0).mean()), float((off <= 2.0).mean())
 
     def add(
-        self,
-        scene: Scene,
-        result: PerceptionResult,
-        by_median: Sequence[LocatedCars],
-        true: TrueBoxes,
+        self, scene: Scene, result: PerceptionResult, by_median: Sequence[LocatedCars], true: TrueBoxes
     ) -> None:
         """Count one capture, with its `true_boxes` and each view's cars located by the thesis's method."""
         pose = result.captured.capture.pose
@@ -130,7 +125,6 @@ class SurveyScore:
 
 
 def _matched(found: NDArray[np.float32], boxes: VehicleBoxes) -> NDArray[np.int64]:
-    """Return the id of the vehicle that each detection matches, (n,); 0 for none."""
     match = np.zeros(len(found), dtype=np.int64)
     best = np.full(len(found), MATCH)
     area = (found[:, 2] - found[:, 0]) * (found[:, 3] - found[:, 1])

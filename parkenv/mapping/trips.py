@@ -58,8 +58,6 @@ class Trip:
 
 @dataclass(frozen=True, eq=False)
 class SlotStates:
-    """What a trip says about the states of the k slots that it observed, each when it was first observed."""
-
     slots: NDArray[np.int64]  # (k,) in the order of their first observations
     time: FloatArray  # (k,) of the first observation, on the clock of `Trip.time`
     likelihood: (

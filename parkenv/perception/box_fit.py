@@ -20,21 +20,14 @@ _STEPS = 90
 
 
 class FittedCar(NamedTuple):
-    """A car's rectangle.
+    """A car's rectangle, m."""
 
-    Attributes:
-        x, y: m, its centre.
-        yaw: rad, along the car, in [0, π): beams do not distinguish front and rear.
-        length, width: m; at least those of a typical car.
-        seen_length, seen_width: m, visible part of a side and of an end; near 0 for a side that is not visible.
-    """
-
-    x: float
+    x: float  # its centre
     y: float
-    yaw: float
-    length: float
+    yaw: float  # rad, along the car, in [0, π): beams do not distinguish front and rear
+    length: float  # at least that of a typical car, as the width
     width: float
-    seen_length: float
+    seen_length: float  # visible part of a side and of an end; near 0 for a side that is not visible
     seen_width: float
 
 
@@ -48,11 +41,8 @@ def fit_box(
     any car is a flank; without one, `end_on` distinguishes front and flank. Partly visible sides are extended to a
     car's usual size, away from the sensor or beyond the point where the view is cut.
 
-    Args:
-        points: (k, 2) m, k at least 1, world frame, in order of direction.
-        sensor: (2,) m, position of the sensor.
-        end_on: whether the front or rear of the car is visible rather than its flank.
-        cut: whether the car continues unseen before the first and after the last point.
+    Points, (k, 2) m, are in order of direction; `cut` says whether the car continues unseen before the first and after
+    the last one.
 
     Examples:
         >>> front = np.stack([np.linspace(-0.9, 0.9, 30), np.full(30, 4.0)], axis=1)
@@ -68,8 +58,7 @@ def fit_box(
     low, high = local.min(axis=0), local.max(axis=0)
     extent = high - low
     sight = np.abs(0.5 * (low + high) - seen_from)
-    lies = extent if extent.max() > LONG_SIDE else sight if end_on else -sight
-    along = int(lies.argmax())
+    along = int((extent if extent.max() > LONG_SIDE else sight if end_on else -sight).argmax())
     size = np.full(2, CAR_WIDTH)
     size[along] = CAR_LENGTH
     size = np.maximum(size, extent)
@@ -97,7 +86,6 @@ def fit_box(
 
 @compiled
 def _direction(points: FloatArray) -> float:
-    """Return the angle in [0, π/2) of the rectangle whose visible sides are closest to the points."""
     best, answer = -1.0, 0.0
     for step in range(_STEPS):
         theta = 0.5 * math.pi * step / _STEPS
@@ -113,8 +101,7 @@ def _direction(points: FloatArray) -> float:
         for k in range(len(points)):
             a = c * points[k, 0] + s * points[k, 1]
             b = c * points[k, 1] - s * points[k, 0]
-            d = min(min(a - low1, high1 - a), min(b - low2, high2 - b))
-            value += 1.0 / max(d, _NEAREST)
+            value += 1.0 / max(min(min(a - low1, high1 - a), min(b - low2, high2 - b)), _NEAREST)
         if value > best:
             best, answer = value, theta
     return answer

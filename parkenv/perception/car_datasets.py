@@ -37,7 +37,6 @@ class LabelledImage:
 
 
 def read_uiuc_training(folder: Path) -> Crops:
-    """Read UIUC's training images: `TrainImages/pos-N.pgm` and `neg-N.pgm`."""
     images = {file.name: as_grey(read_image(file)) for file in images_in(folder / "TrainImages")}
     crops = Crops(
         *([im for name, im in images.items() if name.startswith(kind)] for kind in ("pos-", "neg-"))

@@ -95,7 +95,6 @@ class CarModel:
 
     @classmethod
     def load(cls, name: str | Path) -> CarModel:
-        """Load a packaged model by name, or a model from a file."""
         if str(name) in PACKAGED_MODELS:
             source = resources.files("parkenv.perception") / "models" / f"{name}.npz"
             parts = parse_arrays(source.read_bytes(), str(name))

@@ -47,13 +47,11 @@ class RecallPrecision:
 
     @property
     def average_precision(self) -> float:
-        """Area under the curve, with the best precision at this recall or a higher one."""
         best = np.maximum.accumulate(self.precision[::-1])[::-1]
         return float(np.sum(np.diff(self.recall, prepend=0.0) * best))
 
     @property
     def at_equal_error(self) -> tuple[float, float]:
-        """Recall and precision at the equal-error point; zeros without detections."""
         if not len(self.recall):
             return 0.0, 0.0
         i = int(np.minimum(self.recall, self.precision).argmax())
@@ -73,9 +71,9 @@ def recall_precision(
     """
     cars = sum(len(t) for t in truth)
     hits, values = [], []
-    for found, score, true in zip(boxes, scores, truth, strict=True):
+    for detected, score, true in zip(boxes, scores, truth, strict=True):
         order = np.argsort(-np.asarray(score), kind="stable")
-        hits.append(matches(np.asarray(found, dtype=np.float64)[order], true, scales=scales))
+        hits.append(matches(np.asarray(detected, dtype=np.float64)[order], true, scales=scales))
         values.append(np.asarray(score, dtype=np.float64)[order])
     hit, value = np.concatenate(hits), np.concatenate(values)
     order = np.argsort(-value, kind="stable")
@@ -85,16 +83,15 @@ def recall_precision(
     return RecallPrecision(right[last] / max(cars, 1), right[last] / (last + 1.0))
 
 
-def matches(found: FloatArray, true: FloatArray, *, scales: bool = True) -> NDArray[np.bool_]:
+def matches(detected: FloatArray, true: FloatArray, *, scales: bool = True) -> NDArray[np.bool_]:
     """Return which detections of an image, (n, 4), best first, match a car that no better one has matched."""
-    hit = np.zeros(len(found), dtype=np.bool_)
+    hit = np.zeros(len(detected), dtype=np.bool_)
     if not len(true):
         return hit
     size = true[:, 2:] - true[:, :2]
     taken = np.zeros(len(true), dtype=np.bool_)
-    for i, box in enumerate(found):
-        away = ((box[:2] + box[2:] - true[:, :2] - true[:, 2:]) / 2.0 / (REACH * size)) ** 2
-        off = away.sum(axis=1)
+    for i, box in enumerate(detected):
+        off = (((box[:2] + box[2:] - true[:, :2] - true[:, 2:]) / 2.0 / (REACH * size)) ** 2).sum(axis=1)
         if scales:
             off += ((box[2] - box[0] - size[:, 0]) / (REACH * size[:, 0])) ** 2
         off[taken] = np.inf
@@ -104,15 +101,9 @@ def matches(found: FloatArray, true: FloatArray, *, scales: bool = True) -> NDAr
     return hit
 
 
-@dataclass(frozen=True, eq=False)
-class TestSetScore:
-    row: dict[str, Any]
-    curve: RecallPrecision
-
-
 def score_on_uiuc(
     model: CarModel | Detector, folder: Path, *, on_image: Callable[[], None] = lambda: None
-) -> list[TestSetScore]:
+) -> list[dict[str, Any]]:
     """Measure recall and precision of a side model, or any detector, on the test sets in UIUC's folder `CarData`."""
     sets = [name for name, (_, truth) in UIUC_TESTS.items() if (folder / truth).is_file()] or ["single"]
     return [score_on(model, read_uiuc_test(folder, name), name, on_image=on_image) for name in sets]
@@ -124,7 +115,7 @@ def score_on(
     test_set: str,
     *,
     on_image: Callable[[], None] = lambda: None,
-) -> TestSetScore:
+) -> dict[str, Any]:
     """Measure recall and precision on labelled images, by UIUC's matching rule.
 
     A model's windows are searched at the sizes of the set's cars. A detector works as it does anywhere; its boxes of
@@ -134,20 +125,20 @@ def score_on(
     least, most = (size * UIUC_SIZE[1] for size in _SIZES[test_set])
     is_model = isinstance(model, CarModel)
     detector = HogDetector.for_evaluation(model, least, most) if isinstance(model, CarModel) else model
-    found, begun = [], time.perf_counter()
+    detected, begun = [], time.perf_counter()
     for labelled in images:
         detections = detector.detect(labelled.image)
-        found.append(detections if is_model else _of_the_set(detections, test_set))
+        detected.append(detections if is_model else _of_the_set(detections, test_set))
         on_image()
     seconds = time.perf_counter() - begun
     curve = recall_precision(
-        [f.regions for f in found],
-        [f.score for f in found],
+        [d.regions for d in detected],
+        [d.score for d in detected],
         [i.boxes for i in images],
         scales=test_set == "multi",
     )
     recall, precision = curve.at_equal_error
-    row = {
+    return {
         "test_set": test_set,
         "images": len(images),
         "cars": sum(len(i.boxes) for i in images),
@@ -157,15 +148,14 @@ def score_on(
         "precision": precision,
         "frames_per_s": len(images) / seconds,
     }
-    return TestSetScore(row, curve)
 
 
-def _of_the_set(found: Detections, test_set: str) -> Detections:
-    width = (found.regions[:, 2] - found.regions[:, 0]) / UIUC_SIZE[0]
+def _of_the_set(detections: Detections, test_set: str) -> Detections:
+    width = (detections.regions[:, 2] - detections.regions[:, 0]) / UIUC_SIZE[0]
     least, most = _SIZES[test_set]
-    size = found.boxes[:, 2:] - found.boxes[:, :2]
-    side = ~found.end_on | (size[:, 0] > END_WIDEST * size[:, 1])
-    return found.select(side & (width >= least / _TOLERANCE) & (width <= most * _TOLERANCE))
+    size = detections.boxes[:, 2:] - detections.boxes[:, :2]
+    side = ~detections.end_on | (size[:, 0] > END_WIDEST * size[:, 1])
+    return detections.select(side & (width >= least / _TOLERANCE) & (width <= most * _TOLERANCE))
 
 
 def recall_on_crops(
@@ -204,9 +194,9 @@ def _crop_scores(
         return model.scores(resized).astype(np.float64)
     scores = []
     for image in images:
-        found, size = model.detect(image), np.array(image.shape[1::-1])
-        off = np.abs(0.5 * (found.boxes[:, :2] + found.boxes[:, 2:]) / size - 0.5).max(axis=1)
-        wide = (found.boxes[:, 2] - found.boxes[:, 0]) / size[0]
-        scores.append(found.probability[(off < _CROP_MIDDLE) & (wide > _CROP_WIDTH)].max(initial=0.0))
+        detections, size = model.detect(image), np.array(image.shape[1::-1])
+        off = np.abs(0.5 * (detections.boxes[:, :2] + detections.boxes[:, 2:]) / size - 0.5).max(axis=1)
+        wide = (detections.boxes[:, 2] - detections.boxes[:, 0]) / size[0]
+        scores.append(detections.probability[(off < _CROP_MIDDLE) & (wide > _CROP_WIDTH)].max(initial=0.0))
         on_image()
     return np.array(scores, dtype=np.float64)

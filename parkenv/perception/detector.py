@@ -16,8 +16,7 @@ Float = TypeVar("Float", np.float32, np.float64)
 LEAST_PROBABILITY = 0.08
 """Least probability of the boxes that a detector should return. The pipeline keeps a box below `PROBABILITY` only if
 the range measurements in it fit a car on the ground."""
-PROBABILITY = 0.25
-"""Least probability of a detection that no range measurements confirm."""
+PROBABILITY = 0.25  # least probability of a detection that no range measurements confirm
 
 
 class Detections:
@@ -106,7 +105,6 @@ class DetectorErrors(NamedTuple):
     std: tuple[float, float, float, float] = (0.06, 0.04, 0.06, 0.045)
 
     def corrected(self, boxes: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return boxes, (n, 4), without their mean error."""
         shift = np.array(self.shift)
         height = (boxes[:, 3] - boxes[:, 1]) / (1.0 + shift[3] - shift[1])
         return np.asarray(boxes - height[:, None] * shift, dtype=np.float64)
@@ -166,9 +164,7 @@ class BandDetector(Protocol):
     It is called in several threads at once.
     """
 
-    def detect_on_ground(self, image: Image, band: GroundBand) -> Detections:
-        """Find the cars in one image as `Detector.detect` does, only those whose boxes lie in the band."""
-        ...
+    def detect_on_ground(self, image: Image, band: GroundBand) -> Detections: ...
 
 
 def _checked(name: str, values: NDArray[np.floating], shape: tuple[int, ...]) -> Float32Array:

@@ -64,7 +64,6 @@ class Descriptor:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape of a window's features: rows, values per cell, columns."""
         rows, columns = self.height // CELL, self.width // CELL
         if self.normalization == "blocks":
             return rows - 1, 4 * ORIENTATIONS, columns - 1
@@ -75,25 +74,16 @@ class Descriptor:
         return math.prod(self.shape)
 
     def features(self, image: Image) -> Float32Array:
-        """Compute the features of a whole image; a window on the grid of cells is a slice of `shape`.
+        """Compute the features of a whole image, (h, w) uint8, grey: (rows, values, columns) float32.
 
-        Args:
-            image: (h, w) uint8, grey.
-
-        Returns:
-            (rows, values, columns) float32; columns come last, so that compiled loops run along them.
+        Columns come last, so that compiled loops run along them. A window on the grid of cells is a slice of `shape`.
         """
         cells = cell_histograms(cv2.LUT(_checked(image), _ROOT) if image.size else image)
         normalize = {"cell": _by_cell, "neighbors": _by_neighbors, "blocks": _by_blocks}[self.normalization]
-        features: Float32Array = normalize(cells)
-        return features
+        return np.asarray(normalize(cells))
 
     def describe(self, crop: Image) -> Float32Array:
-        """Compute the descriptor of one window, (size,) float32.
-
-        Args:
-            crop: (height, width) uint8, grey; its border pixels are replicated.
-        """
+        """Compute the descriptor, (size,) float32, of one window, (height, width) uint8, whose border is replicated."""
         if crop.shape != (self.height, self.width):
             raise InputError(f"crop is {crop.shape}, want ({self.height}, {self.width})")
         # One more cell on each side, because a window in an image has neighbours.
@@ -109,33 +99,24 @@ def _checked(image: Image) -> Image:
 
 
 def cell_histograms(image: Image) -> Float32Array:
-    """Compute the histogram of oriented gradients of every cell.
+    """Compute the histogram of oriented gradients of every cell, (h // 8, 9, w // 8) float32, of an image, uint8.
 
     Gradients are central differences; the magnitude of each is distributed, linearly by distance, over the two nearest
-    orientations and the four nearest cells.
-
-    Args:
-        image: (h, w) uint8; pixels beyond the last whole cell are ignored.
-
-    Returns:
-        (h // 8, 9, w // 8) float32; orientation k is centred at (k + 0.5)/9 of half a turn, counted from a gradient
-        along the columns.
+    orientations and the four nearest cells. Orientation k is centred at (k + 0.5)/9 of half a turn, counted from a
+    gradient along the columns.
     """
     _checked(image)
     rows, columns = image.shape[0] // CELL, image.shape[1] // CELL
     if rows == 0 or columns == 0:
         return np.zeros((rows, ORIENTATIONS, columns), dtype=np.float32)
-    cells: Float32Array = _histograms(
-        cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE), rows, columns
-    )
-    return cells
+    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    return np.asarray(_histograms(padded, rows, columns))
 
 
 @compiled(**_FAST)
 def _gradients(
     above: Image, row: Image, below: Image, magnitude: Float32Array, weighted_bin: Float32Array
 ) -> None:
-    """Compute for each pixel the magnitude, and the magnitude times the orientation in bins, -0.5 to 8.5."""
     one_bin = np.float32(ORIENTATIONS / math.pi)
     for x in range(len(magnitude)):
         gx = np.float32(np.int32(row[x + 2]) - np.int32(row[x]))
@@ -161,7 +142,6 @@ def _gradients(
 
 @compiled(**_FAST)
 def _share(m: np.float32, q: np.float32, k: np.float32) -> np.float32:
-    """Return the weight of a gradient in bin k: its magnitude, falling linearly with the distance in bins."""
     return max(np.float32(0.0), m - abs(q - m * k))
 
 
@@ -171,12 +151,8 @@ def _bin_rows(
 ) -> None:
     """Add four rows of gradients to every bin of the cells whose centres lie above and below them.
 
-    Args:
-        m: (4, w), magnitudes.
-        q: (4, w), magnitudes times bins.
-        first: weight of the first row for the cells below; it grows by 1/8 a row.
-        upper: (9, 4 + w + 4), sums for the cells above, changed in place.
-        lower: the same for those below.
+    `m` and `q`, (4, w), are magnitudes, and magnitudes times bins; `first` is the weight of the first row for the cells
+    below, which grows by 1/8 a row. The sums `upper` and `lower`, (9, 4 + w + 4), are changed in place.
     """
     step = np.float32(1.0 / CELL)
     f0, f1, f2, f3 = first, first + step, first + step + step, first + step + step + step
@@ -199,7 +175,6 @@ def _bin_rows(
 
 @compiled(**_FAST)
 def _pool(sums: Float32Array, tent: Float32Array, out: Float32Array) -> None:
-    """Sum columns of pixels to columns of cells, with a triangular window two cells wide."""
     for k in range(ORIENTATIONS):
         for c in range(out.shape[1]):
             total = np.float32(0.0)
@@ -297,14 +272,9 @@ def _by_neighbors(cells: Float32Array) -> Float32Array:
 
 @compiled(**_FAST)
 def correlate(features: Float32Array, weights: Float32Array) -> Float32Array:
-    """Correlate: the dot product of the weights with every window of the features.
+    """Return the dot product of the weights with every window of the features, both (rows, values, columns) float32.
 
-    Args:
-        features: (rows, values, columns) float32.
-        weights: (window rows, values, window columns) float32.
-
-    Returns:
-        (rows - window rows + 1, columns - window columns + 1) float32; empty where the window is larger.
+    Empty where the window is larger.
     """
     height, width = weights.shape[0], weights.shape[2]
     rows, columns = features.shape[0] - height + 1, features.shape[2] - width + 1

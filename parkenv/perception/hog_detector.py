@@ -32,17 +32,11 @@ _MOST_WINDOWS = 2000  # only the best are kept; a useful model does not report m
 
 
 class CarWindow(NamedTuple):
-    """The window of a HOG model, in which a car always stands at the same place.
+    """The window of a HOG model, in which a car always stands at the same place."""
 
-    Attributes:
-        car: left, top, right, bottom of the car, as fractions of the window.
-        aspect: width over height of the image region that is resized to the window.
-        size: width and height of the window, px.
-    """
-
-    car: tuple[float, float, float, float]
-    aspect: float
-    size: tuple[int, int]
+    car: tuple[float, float, float, float]  # left, top, right, bottom of the car, as fractions of the window
+    aspect: float  # width over height of the image region that is resized to the window
+    size: tuple[int, int]  # width and height of the window, px
 
     def region(self, box: FloatArray) -> FloatArray:
         """Return the image region of a window that is aligned to a car's box: (4,) px, left, top, right, bottom."""
@@ -134,10 +128,10 @@ class HogDetector:
         return self._best(as_grey(image), band)
 
     def _best(self, grey: Image, band: GroundBand | None) -> Detections:
-        found = in_threads(lambda model: self.scan(model, grey, band), self.models)
+        of_each = in_threads(lambda model: self.scan(model, grey, band), self.models)
         all_models = Detections(
             *(
-                np.concatenate([getattr(f, name) for f in found])
+                np.concatenate([getattr(f, name) for f in of_each])
                 for name in ("boxes", "probability", "end_on", "score", "regions")
             )
         )
@@ -167,7 +161,8 @@ class HogDetector:
             scaled = _scaled(grey if smaller is None else smaller, (width * scale_x, height * scale_y))
             if scale_x <= 1.0 and scale_y <= 1.0:
                 smaller = scaled
-            level = _bordered(scaled, edge_x * scale_x, edge_y * scale_y)
+            beside, above = round(edge_x * scale_x), round(edge_y * scale_y)
+            level = np.asarray(cv2.copyMakeBorder(scaled, above, above, beside, beside, cv2.BORDER_REPLICATE))
             first, end = 0, level.shape[0] // CELL
             if band is not None:
                 tops = (np.array(_region_tops(model, region_height, band)) + edge_y) * (scale_y / CELL)
@@ -189,8 +184,7 @@ class HogDetector:
         boxes = np.concatenate(
             [region[:, :2] + left_top * size_xy, region[:, :2] + right_bottom * size_xy], axis=1
         )
-        end_on = np.full(len(value), model.end_on)
-        return Detections(boxes, model.probability(value), end_on, value, region)
+        return Detections(boxes, model.probability(value), np.full(len(value), model.end_on), value, region)
 
 
 def _region_tops(model: CarModel, region_height: float, band: GroundBand) -> tuple[float, float]:
@@ -201,7 +195,6 @@ def _region_tops(model: CarModel, region_height: float, band: GroundBand) -> tup
 
 
 def _features_of_rows(window: Descriptor, level: Image, first: int, end: int) -> Float32Array:
-    """Return the features of the rows of cells from `first` to `end` - 1 of an image, as in the whole image."""
     # The features of a cell depend on the next cells, and their histograms on the pixels of those after them.
     start, stop = max(first - 2, 0), min(end + 2, level.shape[0] // CELL)
     whole = window.features(level[CELL * start : CELL * stop if stop < level.shape[0] // CELL else None])
@@ -252,9 +245,3 @@ def _scaled(image: Image, size: tuple[float, float]) -> Image:
     return np.asarray(
         cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if far else cv2.INTER_LINEAR)
     )
-
-
-def _bordered(level: Image, x: float, y: float) -> Image:
-    """Replicate the border of a pyramid level by x and y px; the same before scaling costs more."""
-    left, top = round(x), round(y)
-    return np.asarray(cv2.copyMakeBorder(level, top, top, left, left, cv2.BORDER_REPLICATE))

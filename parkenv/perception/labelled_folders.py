@@ -26,8 +26,7 @@ Box = tuple[float, float, float, float]
 
 CAR_NAMES = ("car", "cars", "van", "truck", "bus", "pickup", "suv", "vehicle", "automobile", "motor vehicle")
 """Names of classes that count as cars: whatever takes a slot."""
-LEAST_WIDTH = 36
-"""Least width of a car that is trained on, px."""
+LEAST_WIDTH = 36  # least width of a car that is trained on, px
 LEAST_CARS = 20
 _WINDOWS = 3  # windows without cars from each picture
 _TOLERANCE = 2.0  # px that a box may reach outside its picture, by rounding
@@ -76,10 +75,7 @@ def read_labels(path: Path, images: Path | None = None, classes: Sequence[str] =
     or beside the pictures. A picture without one shows nothing. A line has the class and a box (centre, width, height)
     or a polygon, as fractions of the picture. The names of the classes are in `data.yaml` (`names`) or `classes.txt`.
 
-    Args:
-        path: the file or folder.
-        images: of COCO, the folder of the pictures; None: that of the file.
-        classes: names of the classes that are cars; empty: `CAR_NAMES`.
+    `images` is COCO's folder of the pictures, by default that of the file; `classes` are cars, by default `CAR_NAMES`.
     """
     if path.is_dir() and images is not None:
         raise InputError(
@@ -135,15 +131,8 @@ def crops_of(
     """Cut cars and windows without cars out of labelled photographs.
 
     Cars seen from the side are boxes at least `END_BELOW` times as wide as high, fronts and rears are narrower ones;
-    those of the other kind, cut off by the picture's border, or less than `LEAST_WIDTH` px wide are left out.
-
-    Args:
-        photos: the photographs.
-        end_on: whether to cut out fronts and rears.
-        seed: seed of the windows' places.
-
-    Returns:
-        The crops, aligned as those of the packaged models; and all pictures, to mine false positives from.
+    those of the other kind, cut off by the picture's border, or less than `LEAST_WIDTH` px wide are left out. Crops are
+    aligned as those of the packaged models; false positives are mined from all pictures, which are returned, too.
     """
     car = END if end_on else SIDE
     rng = np.random.default_rng(seed)
@@ -183,10 +172,10 @@ def _photo(
         raise InputError(f"{where}: there is no picture at {file}")
     image = as_grey(read_image(file))
     height, width = image.shape
-    found = np.array([box for _, box, _ in boxes], dtype=np.float64).reshape(-1, 4)
+    corners = np.array([box for _, box, _ in boxes], dtype=np.float64).reshape(-1, 4)
     if fractions:
-        found *= [width, height, width, height]
-    for (label, *_), (left, top, right, bottom) in zip(boxes, found.tolist(), strict=True):
+        corners *= [width, height, width, height]
+    for (label, *_), (left, top, right, bottom) in zip(boxes, corners.tolist(), strict=True):
         inside = (
             min(left, top) >= -_TOLERANCE and right <= width + _TOLERANCE and bottom <= height + _TOLERANCE
         )
@@ -195,9 +184,9 @@ def _photo(
                 f"{label}: box {left:.6g}, {top:.6g} to {right:.6g}, {bottom:.6g} is not inside {file.name} of "
                 f"{width}×{height} px"
             )
-    found = np.clip(found, 0.0, [width, height, width, height])
+    corners = np.clip(corners, 0.0, [width, height, width, height])
     single = np.array([alone for *_, alone in boxes], dtype=np.bool_)
-    return LabelledPhoto(LabelledImage(file.name, image, found), single)
+    return LabelledPhoto(LabelledImage(file.name, image, corners), single)
 
 
 def _cars(names: dict[Any, str], classes: Sequence[str], source: Path) -> set[Any]:
@@ -231,7 +220,6 @@ def _yolo_names(folder: Path) -> dict[Any, str]:
 
 
 def _label_of(picture: Path) -> Path:
-    """Return the label file of a picture: in `labels` in place of the last `images`, else beside it."""
     beside = picture.with_suffix(".txt")
     parts = list(beside.parts)
     if "images" in parts and not beside.is_file():

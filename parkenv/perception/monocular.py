@@ -27,8 +27,7 @@ from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.ground_truth import View
 from sim_sensors.rig import Mount
 
-HEIGHT, HEIGHT_STD = 1.54, 0.12
-"""Height of a car, m, and its standard deviation."""
+HEIGHT, HEIGHT_STD = 1.54, 0.12  # height of a car, m, and its standard deviation
 
 
 class UsualCars(NamedTuple):
@@ -62,8 +61,7 @@ _BY_VIEW = np.array(
         [0.1, 0.2, 0.4, 4.1, 0.7, 0.1],  # side
     ]
 )
-REACH = 15.0
-"""m, beyond which cars are dropped: their distance is worth little."""
+REACH = 15.0  # m, beyond which cars are dropped: their distance is worth little
 _NEAREST = 0.5  # m
 _CUT = 0.8  # m, further standard deviation of the distance of a car that the left or right border cuts
 _EDGE = 0.5  # px, standard deviation of the edge of the smallest box
@@ -75,8 +73,6 @@ _HIDDEN = 0.5  # fraction of a box's lower edge that nearer boxes cover, from wh
 
 
 class RangingErrors(NamedTuple):
-    """Standard deviations of what a single picture is measured with."""
-
     detector: DetectorErrors = DetectorErrors()
     pitch: float = math.radians(0.5)  # rad, of the camera
     heading: float = math.radians(0.5)  # rad, of the vehicle and of the mount
@@ -90,17 +86,13 @@ class RangingErrors(NamedTuple):
 
 
 class GroundView(NamedTuple):
-    """The ground plane as a camera without roll sees it."""
-
     camera: PinholeCamera
     mount: Mount
 
     def slope(self, row: FloatArray) -> FloatArray:
-        """Return how much the rays of rows, px, rise for each metre ahead; negative below the horizon."""
         return np.asarray(np.tan(self.mount.pitch - np.arctan((row - self.camera.cy) / self.camera.fy)))
 
     def aside(self, column: FloatArray, row: FloatArray) -> FloatArray:
-        """Return how far to the right the rays of pixels are for each metre ahead."""
         across = (column - self.camera.cx) / self.camera.fx
         down = (row - self.camera.cy) / self.camera.fy
         return np.asarray(across / (math.cos(self.mount.pitch) + down * math.sin(self.mount.pitch)))
@@ -245,7 +237,6 @@ def corners_of_cars(heading: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _is_hidden(boxes: FloatArray) -> BoolArray:
-    """Return which boxes, (n, 4), have most of their lower edge within a box that reaches further down, (n,)."""
     common = np.minimum(boxes[:, None, 2], boxes[:, 2]) - np.maximum(boxes[:, None, 0], boxes[:, 0])
     lower = boxes[:, 3] > boxes[:, None, 3]
     above = boxes[:, 1] < boxes[:, None, 3]

@@ -41,8 +41,7 @@ net.setInput(numpy.full(shape, 0.5, numpy.float32))
 net.forward(list(net.getUnconnectedOutLayersNames()))
 """
 _passed: set[tuple[str, tuple[int, ...]]] = set()
-_COCO = {1: (0,), 80: (2, 5, 7)}
-"""Cars by the number of classes: the only one, or COCO's car, bus and truck."""
+_COCO = {1: (0,), 80: (2, 5, 7)}  # cars by the number of classes: the only one, or COCO's car, bus and truck
 _BORDER = 114  # grey level around an image in the input
 _CENTER_NUMBERS = 9
 # A tensor whose numbers are in another file has an entry with the key `location`, its field 1, a text of 8 bytes; a
@@ -134,8 +133,7 @@ class OnnxDetector:
         if _ELSEWHERE.search(data):
             raise InputError(f"{name}: keeps its weights in other files; export it as a single file")
         width, height = self.settings.size
-        channels = 1 if self.settings.channels == "grey" else 3
-        empty = np.full((1, channels, height, width), 0.5, np.float32)
+        empty = np.full((1, 1 if self.settings.channels == "grey" else 3, height, width), 0.5, np.float32)
         if not is_known:
             require_runs(data, name, empty.shape)
         shape = self._run(empty).shape
@@ -155,13 +153,7 @@ class OnnxDetector:
     def load(
         cls, path: str | Path, threshold: float | None = None, *, is_known: bool = False
     ) -> OnnxDetector:
-        """Read a network, and the settings beside it (`sidecar_of`).
-
-        Args:
-            path: the file, `.onnx`.
-            threshold: replaces that of the settings.
-            is_known: see the class.
-        """
+        """Read a network, and the settings beside it (`sidecar_of`), of which `threshold` replaces one."""
         data, beside = read_bytes(path, MAX_ONNX_BYTES), sidecar_of(path)
         settings = OnnxSettings.read(beside) if beside.is_file() else OnnxSettings()
         settings = settings if threshold is None else settings.changed(threshold=threshold)
@@ -171,39 +163,39 @@ class OnnxDetector:
         return self.__dict__ | {"_net": None}  # read again where it is needed
 
     def detect(self, image: Image) -> Detections:
-        """Find the cars in an image, best first; see `Detector`."""
         fed, scale, offset = _fed(image, self.settings)
         output = self._run(fed)
         if self._is_centers:
             if self.settings.mirror and min(offset) > 0.0:
+                # What the network puts out for the mirrored input, left and right exchanged.
                 mirrored = self._run(np.ascontiguousarray(fed[..., ::-1]))
-                output = 0.5 * (output + mirrored_centers(mirrored))
-            found = decode_centers(output, self.settings.size, self.settings.threshold)
+                output = 0.5 * (output + mirrored[:, [0, 3, 2, 1, *range(4, _CENTER_NUMBERS)], :, ::-1])
+            decoded = decode_centers(output, self.settings.size, self.settings.threshold)
         else:
-            found = decode_yolo(output, self._cars)
-        if not (np.isfinite(found.boxes).all() and np.isfinite(found.score).all()):
+            decoded = decode_yolo(output, self._cars)
+        if not (np.isfinite(decoded.boxes).all() and np.isfinite(decoded.score).all()):
             raise InputError(f"{self._name}: put out numbers that are not finite, want boxes and scores")
-        if len(found.score) and not (found.score.min() >= -1e-4 and found.score.max() <= 1.0 + 1e-4):
+        if len(decoded.score) and not (decoded.score.min() >= -1e-4 and decoded.score.max() <= 1.0 + 1e-4):
             raise InputError(
-                f"{self._name}: has scores from {found.score.min():.4g} to {found.score.max():.4g}, want 0 to 1"
+                f"{self._name}: has scores from {decoded.score.min():.4g} to {decoded.score.max():.4g}, want 0 to 1"
             )
-        found = found.select(found.score >= self.settings.threshold)
-        found = found._replace(
-            boxes=((found.boxes.astype(np.float64) - np.tile(offset, 2)) / np.tile(scale, 2)).astype(
+        decoded = decoded.select(decoded.score >= self.settings.threshold)
+        decoded = decoded._replace(
+            boxes=((decoded.boxes.astype(np.float64) - np.tile(offset, 2)) / np.tile(scale, 2)).astype(
                 np.float32
             ),
-            score=np.clip(found.score, 0.0, 1.0),
+            score=np.clip(decoded.score, 0.0, 1.0),
         )
-        size = found.boxes[:, 2:] - found.boxes[:, :2]
-        found = found.select(np.isfinite(found.boxes).all(axis=1) & (size > 0.0).all(axis=1))
-        found = found.select(best_boxes(found.boxes, found.score, self.settings.overlap))
-        boxes = found.boxes
-        if found.end_on is None or found.visible is None:
+        size = decoded.boxes[:, 2:] - decoded.boxes[:, :2]
+        decoded = decoded.select(np.isfinite(decoded.boxes).all(axis=1) & (size > 0.0).all(axis=1))
+        decoded = decoded.select(best_boxes(decoded.boxes, decoded.score, self.settings.overlap))
+        boxes = decoded.boxes
+        if decoded.end_on is None or decoded.visible is None:
             width, height = (boxes[:, 2:] - boxes[:, :2]).T
-            return Detections(boxes, found.score, width < END_BELOW * height)
+            return Detections(boxes, decoded.score, width < END_BELOW * height)
         return Detections(
-            boxes, found.score, found.end_on, regions=_regions(boxes, found.end_on), view=found.view,
-            visible_fraction=np.clip(found.visible, 0.0, 1.0),
+            boxes, decoded.score, decoded.end_on, regions=_regions(boxes, decoded.end_on), view=decoded.view,
+            visible_fraction=np.clip(decoded.visible, 0.0, 1.0),
         )  # fmt: skip
 
     def _run(self, fed: Float32Array) -> Float32Array:
@@ -281,12 +273,9 @@ def decode_yolo(output: Float32Array, cars: Sequence[int]) -> Candidates:
 
 
 def decode_centers(output: Float32Array, size: tuple[int, int], threshold: float) -> Candidates:
-    """Return the cells that score higher than their neighbours.
+    """Return the cells that score higher than their neighbours, in an output of the layout `centers`.
 
-    Args:
-        output: (1, 9, rows, columns), see `OnnxDetector`.
-        size: width and height of the input, px.
-        threshold: least P(car).
+    The width and height of the input are in px.
     """
     cells = output[0]
     # Above the cells before it and not below those after it: of equal neighbours one is left.
@@ -304,11 +293,6 @@ def decode_centers(output: Float32Array, size: tuple[int, int], threshold: float
     return Candidates(boxes, score[row, column], end > side, view, visible)
 
 
-def mirrored_centers(output: Float32Array) -> Float32Array:
-    """Return what a network of the layout centers would put out for the mirrored input: left and right exchanged."""
-    return output[:, [0, 3, 2, 1, *range(4, _CENTER_NUMBERS)], :, ::-1]
-
-
 def _highest(score: Float32Array, neighbours: NDArray[np.uint8]) -> Float32Array:
     highest = cv2.dilate(score, neighbours, borderType=cv2.BORDER_CONSTANT, borderValue=-1.0)
     return np.asarray(highest, dtype=np.float32)
@@ -317,7 +301,6 @@ def _highest(score: Float32Array, neighbours: NDArray[np.uint8]) -> Float32Array
 def _fed(
     image: Image, settings: OnnxSettings
 ) -> tuple[Float32Array, tuple[float, float], tuple[float, float]]:
-    """Return the network's input, and scale and offset of the image in it, px."""
     grey = as_grey(image)  # checks the image
     if settings.channels == "grey":
         image = grey[..., None]
@@ -341,9 +324,7 @@ def _fed(
 
 
 def _regions(boxes: Float32Array, end_on: NDArray[np.bool_]) -> Float32Array:
-    """Return the windows around cars that labelled crops have, as those of the HOG models."""
     size = boxes[:, 2:] - boxes[:, :2]
-    square = end_on & (size[:, 0] <= END_WIDEST * size[:, 1])
-    cars = zip(boxes.astype(np.float64), square, strict=True)
+    cars = zip(boxes.astype(np.float64), end_on & (size[:, 0] <= END_WIDEST * size[:, 1]), strict=True)
     regions = [(END if end else SIDE).region(box) for box, end in cars]
     return np.array(regions, dtype=np.float32).reshape(-1, 4)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,8 +72,6 @@ class _Seen(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PerceptionResult:
-    """The pipeline's result for one capture."""
-
     captured: TimedCapture  # the capture and its time
     vehicle: FloatArray  # (3,) estimated x, y in m and yaw in rad of the vehicle, world frame
     views: tuple[CameraView, ...]  # one for each camera and stereo camera of the rig
@@ -144,30 +140,32 @@ class PerceptionPipeline:
     ) -> PerceptionResult:
         vehicle = captured.capture.pose if vehicle is None else vehicle
         views = []
-        disparities = seen.disparities
+        at = np.zeros(3) if callable(vehicle) else vehicle
+        scans = self._range_scans(captured.capture, seen.disparities, at)  # T §3.2.3
         if callable(vehicle):
-            local = self._range_scans(captured.capture, disparities, np.zeros(3))
-            vehicle = vehicle(tuple(local.values()))
-            scans = {name: scan.placed(vehicle) for name, scan in local.items()}
-        else:
-            scans = self._range_scans(captured.capture, disparities, vehicle)  # T §3.2.3
+            vehicle = vehicle(tuple(scans.values()))
+            scans = {name: scan.placed(vehicle) for name, scan in scans.items()}
         for scan in scans.values():
             slots.update_from_scan(scan)  # T §3.3.2, from beams
+        sensors = [name for name, *_ in self.rig.lasers or self.rig.stereo_cameras]
         for name, camera, mount, image in self._images(captured.capture):
-            found = seen.detections[name]
+            detections = seen.detections[name]
             if scans:
-                scan = scans[self._ranging_sensor(name)]
-                cars = localize_cars(found, scan, camera, mount, vehicle)  # eq. 3.2
+                scan = scans[name if name in sensors else sensors[0]]
+                cars = localize_cars(detections, scan, camera, mount, vehicle)  # eq. 3.2
             else:
                 x, y, _ = mount.in_world(vehicle)
                 scan, ground = RangeScan(x, y, np.empty(0), np.empty(0), 0.0), GroundView(camera, mount)
-                cars = localize_boxes(found, ground, vehicle, self.errors, slots.headings_near)
-                boxes = self.errors.detector.corrected(found.boxes)
+                cars = localize_boxes(detections, ground, vehicle, self.errors, slots.headings_near)
+                boxes = self.errors.detector.corrected(detections.boxes)
                 slots.update_from_picture(ground, vehicle, boxes, self.errors)
-            found, cars = _confirmed(found, cars)
+            confirmed = detections.probability >= PROBABILITY
+            confirmed[cars.detection] = True
+            cars = dataclasses.replace(cars, detection=np.cumsum(confirmed)[cars.detection] - 1)
+            detections = detections.select(confirmed)
             placed = slots.update_from_cars(cars)  # T §3.3.2, from detections
-            stereo = None if self.rig.lasers else disparities.get(name)
-            views.append(CameraView(name, camera, mount, image, found, scan, stereo, cars, placed))
+            stereo = None if self.rig.lasers else seen.disparities.get(name)
+            views.append(CameraView(name, camera, mount, image, detections, scan, stereo, cars, placed))
         return PerceptionResult(captured, vehicle, tuple(views), tuple(scans.values()))
 
     def observe(
@@ -184,14 +182,10 @@ class PerceptionPipeline:
         return results, slots.observation()
 
     def _look(self, captured: TimedCapture) -> _Seen:
-        """Find the cars in the images of a capture, and match its stereo pairs."""
         capture = captured.capture
         if self._concurrent and self.rig.stereo_cameras:
-            jobs: list[Callable[[], Any]] = [
-                partial(self._detections, capture),
-                partial(self._disparities, capture),
-            ]
-            return _Seen(*in_threads(operator.call, jobs))
+            of: list[Callable[[Capture], Any]] = [self._detections, self._disparities]
+            return _Seen(*in_threads(lambda part: part(capture), of))
         return _Seen(self._detections(capture), self._disparities(capture))
 
     def _detections(self, capture: Capture) -> dict[str, Detections]:
@@ -208,12 +202,6 @@ class PerceptionPipeline:
         band = GroundBand.of(horizon, mount.z, OFF_GROUND, CAR_HEIGHT, CAR_HEIGHT[0] + OFF_GROUND)
         return self.detector.detect_on_ground(image, band)
 
-    def _ranging_sensor(self, camera: str) -> str:
-        if self.rig.lasers:
-            return self.rig.lasers[0][0]
-        stereo_cameras = [name for name, _, _ in self.rig.stereo_cameras]
-        return camera if camera in stereo_cameras else stereo_cameras[0]
-
     def _disparities(self, capture: Capture) -> dict[str, tuple[StereoCamera, NDArray[np.float32]]]:
         return {
             name: (stereo, disparity(capture.pairs[name], stereo))
@@ -226,19 +214,16 @@ class PerceptionPipeline:
         disparities: dict[str, tuple[StereoCamera, NDArray[np.float32]]],
         vehicle: FloatArray,
     ) -> dict[str, RangeScan]:
-        """Return the range scans by sensor name, lasers first."""
         lasers = {
             name: scan_from_laser(laser, mount, vehicle, capture.scans[name])
             for name, laser, mount in self.rig.lasers
         }
-        stereo = {
+        return lasers | {
             name: scan_from_stereo(camera, mount, vehicle, disparities[name][1])
             for name, camera, mount in self.rig.stereo_cameras
         }
-        return lasers | stereo
 
     def _images(self, capture: Capture) -> list[tuple[str, PinholeCamera, Mount, NDArray[np.uint8]]]:
-        """Return name, camera, mount and image of every camera; of stereo cameras the left one."""
         return [
             *((name, camera, mount, capture.images[name].image) for name, camera, mount in self.rig.cameras),
             *(
@@ -254,10 +239,3 @@ def localize_as_thesis(view: CameraView, vehicle: FloatArray) -> LocatedCars:
         stereo, disparity_px = view.stereo
         return localize_disparity(view.detections, disparity_px, stereo, view.mount, vehicle)
     return localize_median(view.detections, view.scan, view.camera, view.mount, vehicle)
-
-
-def _confirmed(found: Detections, cars: LocatedCars) -> tuple[Detections, LocatedCars]:
-    """Drop detections of low probability that could not be located."""
-    kept = found.probability >= PROBABILITY
-    kept[cars.detection] = True
-    return found.select(kept), dataclasses.replace(cars, detection=np.cumsum(kept)[cars.detection] - 1)

@@ -48,7 +48,6 @@ class RangeScan:
         return np.stack([self.x + distance * np.cos(angle), self.y + distance * np.sin(angle)], axis=1)
 
     def placed(self, vehicle: FloatArray) -> RangeScan:
-        """Return a scan of the vehicle's frame in the frame of the vehicle's pose, (3,) x, y in m and yaw in rad."""
         x, y, yaw = Mount(self.x, self.y).in_world(vehicle)
         return dataclasses.replace(self, x=x, y=y, angle=self.angle + yaw)
 
@@ -75,20 +74,10 @@ def scan_from_stereo(
     """
     camera = stereo.camera
     x, y, yaw = mount.in_world(vehicle)
-    depth = _column_depths(
-        disparity_px,
-        _COLUMNS,
-        camera.fx * stereo.baseline,
-        camera.fy,
-        camera.cy,
-        mount.z,
-        *_BAND,
-        STEREO_RANGE,
-    )
-    middle = _COLUMNS * (np.arange(len(depth)) + 0.5) - camera.cx
-    aside = np.arctan2(middle, camera.fx)
-    distance = depth / np.cos(aside)
-    return RangeScan(x, y, (yaw - aside)[::-1], distance[::-1], STEREO_RANGE)
+    focal_baseline = camera.fx * stereo.baseline
+    depth = _column_depths(disparity_px, focal_baseline, camera.fy, camera.cy, mount.z, *_BAND, STEREO_RANGE)
+    aside = np.arctan2(_COLUMNS * (np.arange(len(depth)) + 0.5) - camera.cx, camera.fx)
+    return RangeScan(x, y, (yaw - aside)[::-1], (depth / np.cos(aside))[::-1], STEREO_RANGE)
 
 
 def disparity(pair: StereoFrame, stereo: StereoCamera) -> Float32Array:
@@ -108,14 +97,13 @@ def disparity(pair: StereoFrame, stereo: StereoCamera) -> Float32Array:
     left, right = (cv2.cvtColor(f.image, cv2.COLOR_RGB2GRAY) for f in (pair.left, pair.right))
     # The matcher skips `most` px at the left border: pad the images there, and cut the padding off again.
     left, right = (cv2.copyMakeBorder(i, 0, 0, most, 0, cv2.BORDER_REPLICATE) for i in (left, right))
-    found = matcher.compute(left, right)[:, most:].astype(np.float32) / 16.0
-    return np.where(found > 0.0, found, np.nan).astype(np.float32)
+    px = matcher.compute(left, right)[:, most:].astype(np.float32) / 16.0
+    return np.where(px > 0.0, px, np.nan).astype(np.float32)
 
 
 @compiled
 def _column_depths(
     disparity_px: Float32Array,
-    columns: int,
     focal_baseline: float,
     fy: float,
     cy: float,
@@ -125,26 +113,26 @@ def _column_depths(
     max_range: float,
 ) -> FloatArray:
     rows, width = disparity_px.shape
-    out = np.full(width // columns, np.nan)
-    found = np.empty(rows * columns)
+    out = np.full(width // _COLUMNS, np.nan)
+    depths = np.empty(rows * _COLUMNS)
     for c in range(len(out)):
         obstacle = 0
         ground = 0.0
         for v in range(rows):
             down = (v + 0.5 - cy) / fy
-            for u in range(c * columns, (c + 1) * columns):
+            for u in range(c * _COLUMNS, (c + 1) * _COLUMNS):
                 d = disparity_px[v, u]
                 if not d > 0.0:
                     continue
                 z = focal_baseline / d
                 level = height - down * z
                 if low <= level <= high and z <= max_range:
-                    found[obstacle] = z
+                    depths[obstacle] = z
                     obstacle += 1
                 elif abs(level) < 0.15 and z <= max_range:
                     ground = max(ground, z)
         if obstacle >= _LEAST_PIXELS:
-            out[c] = np.sort(found[:obstacle])[obstacle // 4]
+            out[c] = np.sort(depths[:obstacle])[obstacle // 4]
         elif ground > 0.0:
             # Free if the ground is visible nearly to the maximum range; otherwise unknown.
             out[c] = np.inf if ground > 0.8 * max_range else np.nan

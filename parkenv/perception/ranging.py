@@ -32,8 +32,7 @@ WHOLE_END = 1.2  # m; a visible edge of this length is the front or rear of a ca
 OFF_GROUND = 0.7  # m; tolerance of the height of a box's lower edge above or below the ground
 CAR_HEIGHT = (0.8, 3.2)  # m; range of the height of a box's upper edge
 _LEAST_BEAMS = 3
-MARGIN = 0.02
-"""Of a picture's size; boxes that come this close to its border count as clipped by it."""
+MARGIN = 0.02  # of a picture's size; boxes that come this close to its border count as clipped by it
 _EXPLAINED = 0.5  # fraction of a box's beams from which they belong to the nearer car of another box
 _SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 
@@ -113,11 +112,8 @@ def car_beams(
     Neighbouring beams whose end points are more than `GAP` apart hit different objects: a car and its background, or an
     obstacle in front of it. Beams near the middle of the box weigh more, because other objects fill its margins.
 
-    Args:
-        scan: the ranges around the car.
-        beams: the beams within the box, counter-clockwise.
-        clipped: whether the image border clips the box before its first and after its last beam: there the laser still
-            sees the car where the camera does not, and the run continues beyond the box.
+    Beams come counter-clockwise. Where the image border clips the box before its first or after its last beam, the
+    laser still sees the car where the camera does not, and the run continues beyond the box.
     """
     met = np.flatnonzero(np.isfinite(scan.distance))
     inside = np.flatnonzero(np.isin(met, beams))
@@ -125,8 +121,7 @@ def car_beams(
         return CarBeams(met[:0], (False, False))
     step = np.diff(scan.points(met), axis=0)
     run = np.r_[0, np.cumsum(np.hypot(step[:, 0], step[:, 1]) > GAP)]
-    middle = 0.5 * (scan.angle[beams[0]] + scan.angle[beams[-1]])
-    off = np.abs(_wrapped(scan.angle[met[inside]] - middle))
+    off = np.abs(_wrapped(scan.angle[met[inside]] - 0.5 * (scan.angle[beams[0]] + scan.angle[beams[-1]])))
     weight = np.bincount(run[inside], 1.0 - off / (off.max() + 1e-9))
     ends = np.flatnonzero(run == weight.argmax())
     # Boxes are not exact: a run that ends a little outside the box is still the car, and its end is visible.
@@ -208,7 +203,6 @@ def localize_cars(
 def localize_median(
     detections: Detections, scan: RangeScan, camera: PinholeCamera, mount: Mount, vehicle: FloatArray
 ) -> LocatedCars:
-    """Locate the detected cars as the thesis does: directly behind the median of all beams in the box (eq. 3.2)."""
     _require_same_axis(scan, mount, vehicle)
     margins = bearings(camera, mount, vehicle, detections.boxes)
     distance = [median_distance(scan, beams_between(scan, left, right)) for left, right in margins]
@@ -236,7 +230,6 @@ def localize_disparity(
 def _cars_behind(
     detections: Detections, distance: FloatArray, margins: FloatArray, x: float, y: float
 ) -> LocatedCars:
-    """Place cars behind the distance measured in the middle of their boxes; drop those without a measurement."""
     rows = np.flatnonzero(np.isfinite(distance.reshape(-1)))
     end_on, middle, distance = detections.end_on[rows], margins[rows].mean(axis=1), distance[rows]
     depth = distance + 0.5 * np.where(end_on, CAR_LENGTH, CAR_WIDTH)
@@ -260,7 +253,6 @@ def _require_same_axis(scan: RangeScan, mount: Mount, vehicle: FloatArray) -> No
 
 
 def _is_on_ground(box: Float32Array, distance: float, camera: PinholeCamera, mount: Mount) -> bool:
-    """Return whether a box at this distance, m, spans the heights of a car on the ground."""
     left, top, right, bottom = box.tolist()
     aside = math.atan((0.5 * (left + right) - camera.cx) / camera.fx)
     depth = distance * math.cos(aside)

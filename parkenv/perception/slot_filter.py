@@ -44,13 +44,10 @@ class SlotStates:
 
     @property
     def occupied(self) -> NDArray[np.bool_]:
-        """(n_slots,) bool, the indicator of eq. 3.11."""
         return self.p_occupied > 0.5
 
 
 class SlotObservation(NamedTuple):
-    """The slots that were observed, and their observed states."""
-
     slots: IntArray  # (k,) int64, ascending
     taken: NDArray[np.bool_]  # (k,) bool
 
@@ -96,12 +93,14 @@ class SlotFilter:
         return np.where(away <= 2.0 * self._size[nearest, 0], self.lot.slot_yaw[nearest], np.nan)
 
     def _attributed(self, cars: LocatedCars) -> tuple[IntArray, FloatArray]:
-        """Return the slot of each car as `slots_of`, and the probability that it is the right one, (n,)."""
         if not len(cars):
             return np.empty(0, dtype=np.int64), np.empty(0)
         if cars.covariance is None:
             nearest = np.asarray(self._tree.query(cars.xy)[1], dtype=np.int64)
-            local = self._in_slot(cars.xy, nearest)
+            yaw, away = self.lot.slot_yaw[nearest], cars.xy - self.lot.slot_xy[nearest]
+            along = np.cos(yaw) * away[:, 0] + np.sin(yaw) * away[:, 1]
+            across = np.cos(yaw) * away[:, 1] - np.sin(yaw) * away[:, 0]
+            local = np.stack([along, across], axis=1)
             inside = (np.abs(local) <= self._size[nearest] + MARGIN).all(axis=1)
             return np.where(inside, nearest, -1).astype(np.int64), np.ones(len(cars))
         ranks = list(range(1, min(_CANDIDATES, self.lot.n_slots) + 1))
@@ -187,7 +186,8 @@ class SlotFilter:
         end = np.repeat(corners[:, :4, 1].min(axis=1)[:, None], len(others), axis=1)
         end[:, len(boxes) :] = high[:, 1, None] + 1.0
         hidden = ((covered > _OCCLUDED) & (others[:, 3] >= end)).any(axis=1)
-        hidden |= np.array([self._is_walled((x, y), self.lot.slot_xy[slot]) for slot in near], dtype=np.bool_)
+        sights = [LineString([(x, y), self.lot.slot_xy[slot]]) for slot in near]
+        hidden |= np.array([len(self._walls.query(s, predicate="intersects")) > 0 for s in sights], np.bool_)
         clear = (inside >= [1.0, _SHOWN_HEIGHT]).all(axis=1) & ~hidden
         near, away = near[clear], np.hypot(*(self.lot.slot_xy[near[clear]] - [x, y]).T)
         shift = np.hypot(errors.position, errors.heading * away)
@@ -198,10 +198,6 @@ class SlotFilter:
     @cached_property
     def _walls(self) -> STRtree:
         return STRtree([LineString(wall) for wall in self.lot.walls])
-
-    def _is_walled(self, eye: tuple[float, float], point: FloatArray) -> bool:
-        line = LineString(np.array([eye, point]))
-        return bool(len(self._walls.query(line, predicate="intersects")))
 
     def states(self) -> SlotStates:
         """Return the current estimate."""
@@ -214,19 +210,12 @@ class SlotFilter:
         return SlotObservation(slots, self.log_odds[slots] > 0.0)
 
     def _add(self, slots: IntArray, log_odds: FloatArray) -> None:
-        """Add evidence, (k,), to different slots, (k,); 0 is none."""
         self.log_odds[slots] = np.clip(self.log_odds[slots] + log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS)
         changed = slots[log_odds != 0.0]
         self.in_view[changed] = self.updated[changed] = True
 
     def _slots_near(self, x: float, y: float, reach: float) -> IntArray:
         return np.array(sorted(self._tree.query_ball_point([x, y], reach)), dtype=np.int64)
-
-    def _in_slot(self, xy: FloatArray, slot: IntArray) -> FloatArray:
-        yaw = self.lot.slot_yaw[slot]
-        away = xy - self.lot.slot_xy[slot]
-        along = np.cos(yaw) * away[:, 0] + np.sin(yaw) * away[:, 1]
-        return np.stack([along, np.cos(yaw) * away[:, 1] - np.sin(yaw) * away[:, 0]], axis=1)
 
 
 def _logit(p: FloatArray | float) -> FloatArray:
@@ -275,7 +264,6 @@ def _beams_on_slots(
 def _crossing(
     ox: float, oy: float, ux: float, uy: float, half_x: float, half_y: float
 ) -> tuple[float, float]:
-    """Return where a ray enters and leaves a rectangle around the origin; enter > leave if it misses."""
     enter, leave = -math.inf, math.inf
     for o, u, half in ((ox, ux, half_x), (oy, uy, half_y)):
         if abs(u) < 1e-12:

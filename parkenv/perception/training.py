@@ -16,8 +16,6 @@ from parkenv.perception.detector import overlaps
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, best_boxes
 
-Progress = Callable[[str], None]
-
 CAR_OVERLAP = 0.25
 _LEAST = 20
 _PER_IMAGE = 5  # largest number of hard negatives from one image per round
@@ -55,7 +53,7 @@ def train(
     end_on: bool = False,
     settings: TrainingSettings | None = None,
     trained_on: str = "",
-    progress: Progress = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> CarModel:
     """Train a model; equal arguments give bitwise equal weights on one machine.
 
@@ -65,20 +63,9 @@ def train(
     model that has only seen whole cars finds small ones in the parts of a large one. Probabilities are calibrated on
     cross-validated scores (Platt 1999).
 
-    Args:
-        positives: aligned grey crops of cars, uint8; resized to the window.
-        negatives: grey images of any size without cars.
-        photos: images with all cars labelled; false positives beside and within the cars are mined, too.
-        descriptor: None: 128×64, for side views.
-        region_aspect: width over height of the crops; None: that of the first crop.
-        car: left, top, right, bottom of the car in the crops, as fractions.
-        end_on: whether the crops show fronts and rears rather than sides.
-        settings: None: the defaults.
-        trained_on: one line that describes the training data.
-        progress: called with one line for each stage.
-
-    Raises:
-        InputError: fewer than 20 positives, or no negatives.
+    Crops are grey, uint8; positives, at least 20, are aligned, with the `car` at these fractions of their left, top,
+    right and bottom, and resized to the window. False positives beside and within the labelled cars of `photos` are
+    mined, too.
     """
     if len(positives) < _LEAST or not negatives:
         raise InputError(
@@ -122,10 +109,7 @@ def train(
 
 
 def _enlarged(
-    positives: Sequence[Image],
-    negatives: Sequence[Image],
-    car: tuple[float, float, float, float],
-    by: float,
+    positives: Sequence[Image], negatives: Sequence[Image], car: tuple[float, float, float, float], by: float
 ) -> list[LabelledImage]:
     if not by:
         return []
@@ -134,12 +118,9 @@ def _enlarged(
         return np.asarray(cv2.resize(image, None, fx=by, fy=by, interpolation=cv2.INTER_CUBIC))
 
     others = [LabelledImage("", larger(n), _NO_CARS) for n in negatives]
-    for crop in positives:
-        image = larger(crop)
-        height, width = image.shape
-        box = np.array([car]) * [width, height, width, height]
-        others.append(LabelledImage("", image, box))
-    return others
+    cars = [larger(crop) for crop in positives]
+    boxes = [np.array([car]) * [*image.shape[::-1], *image.shape[::-1]] for image in cars]
+    return others + [LabelledImage("", image, box) for image, box in zip(cars, boxes, strict=True)]
 
 
 def mined(model: CarModel, images: Sequence[LabelledImage]) -> Float32Array:
@@ -149,7 +130,7 @@ def mined(model: CarModel, images: Sequence[LabelledImage]) -> Float32Array:
     """
     window = model.descriptor
     size = (window.width, window.height)
-    found = [np.empty((0, window.size), dtype=np.float32)]
+    descriptors = [np.empty((0, window.size), dtype=np.float32)]
     for labelled in images:
         image = labelled.image
         least = min(image.shape[0], image.shape[1] / model.region_aspect, 40.0)
@@ -161,8 +142,10 @@ def mined(model: CarModel, images: Sequence[LabelledImage]) -> Float32Array:
         for car in labelled.boxes:
             seen = seen.select(overlaps(car, seen.boxes) <= CAR_OVERLAP)
         seen = seen.select(best_boxes(seen.regions, seen.score, 0.6)[:_PER_IMAGE])
-        found += [window.describe(cut_out(image, region, size))[None] for region in seen.regions.tolist()]
-    return np.concatenate(found)
+        descriptors += [
+            window.describe(cut_out(image, region, size))[None] for region in seen.regions.tolist()
+        ]
+    return np.concatenate(descriptors)
 
 
 def _svm(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tuple[Float32Array, float]:
@@ -171,11 +154,7 @@ def _svm(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tup
         from threadpoolctl import threadpool_limits
 
     machine = LinearSVC(
-        C=settings.penalty,
-        loss="hinge",
-        random_state=settings.seed,
-        max_iter=3_000,
-        tol=1e-3,
+        C=settings.penalty, loss="hinge", random_state=settings.seed, max_iter=3_000, tol=1e-3
     )
     x = np.concatenate([yes, no]).astype(np.float64)
     with threadpool_limits(1):
@@ -219,7 +198,6 @@ def cut_out(image: Image, region: Sequence[float], size: tuple[int, int]) -> Ima
 
 
 def _shifted(crop: Image, size: tuple[int, int], dx: float, dy: float, grow: float) -> Image:
-    """Return a window that is shifted, and larger on each side, by fractions of the crop's sides."""
     height, width = crop.shape
     ends = (dx - grow) * width, (dy - grow) * height, (1.0 + dx + grow) * width, (1.0 + dy + grow) * height
     return cut_out(crop, ends, size)

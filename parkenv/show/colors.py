@@ -54,7 +54,6 @@ _PALENESS = 0.62
 
 
 def rgb(color: Any) -> Color:
-    """Return a colour of `PALETTE`, of "#rrggbb" or of three numbers as red, green and blue, 0..255."""
     if isinstance(color, str) and not color.startswith("#"):
         return PALETTE[color]
     red, green, blue = bytes.fromhex(color[1:]) if isinstance(color, str) else map(int, color)
@@ -62,18 +61,15 @@ def rgb(color: Any) -> Color:
 
 
 def hex_color(name: str) -> str:
-    """Return a colour of `PALETTE` as "#rrggbb", for figures."""
     return "#{:02x}{:02x}{:02x}".format(*PALETTE[name])
 
 
 def mixed_color(start: str | Color, end: str | Color, share: float) -> Color:
-    """Interpolate between two colours."""
     red, green, blue = (round(a + share * (b - a)) for a, b in zip(rgb(start), rgb(end), strict=True))
     return red, green, blue
 
 
 def _belief_scale() -> Image:
-    """Colours, (2, 256, 3), of P(taken) = i/255: pale for unobserved slots, full for observed ones."""
     anchors = np.array(BELIEF_ANCHORS, dtype=np.float64)
     at = np.linspace(0.0, len(anchors) - 1.0, 256)
     full = np.stack([np.interp(at, np.arange(len(anchors)), channel) for channel in anchors.T], axis=1)
@@ -87,5 +83,4 @@ BELIEF_SCALE = _belief_scale()
 
 def belief_colors(p_occupied: NDArray[np.floating], seen: NDArray[np.bool_]) -> Image:
     """Return the colours, (n, 3) uint8 RGB, of slots with these probabilities of being taken, (n,)."""
-    colors: Image = BELIEF_SCALE[seen.astype(np.intp), np.round(255.0 * p_occupied).astype(np.intp)]
-    return colors
+    return np.asarray(BELIEF_SCALE[seen.astype(np.intp), np.round(255.0 * p_occupied).astype(np.intp)])

@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 from parkenv.world.cost_terms import COST_TERMS
 
-SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")
-"""Columns of a setting of costs and speeds."""
+SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # columns of a setting of costs and speeds
 
 
 class Column(NamedTuple):
@@ -75,5 +74,4 @@ SHARED = (
 
 
 def shared(*keys: str) -> tuple[Column, ...]:
-    """Return some columns of `SHARED`, for a study with another order."""
     return tuple(column for column in SHARED if column.key in keys)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 
-LEAST_SEARCHES = 5
-"""Searches below which no interval is shown: a bootstrap of fewer covers less than 95 %."""
+LEAST_SEARCHES = 5  # searches below which no interval is shown: a bootstrap of fewer covers less than 95 %
 
 
 def plural(number: int, noun: str, several: str | None = None) -> str:
@@ -25,8 +24,7 @@ def number_text(value: float, spec: str) -> str:
         >>> number_text(-0.04, "+.1f"), number_text(0.06, "+.1f")
         ('0.0', '+0.1')
     """
-    text = format(value, spec)
-    return re.sub(r"^[+-](?=[0.]*%?$)", "", text)
+    return re.sub(r"^[+-](?=[0.]*%?$)", "", format(value, spec))
 
 
 def interval_text(value: float, ends: tuple[float, float] | list[float] | None, spec: str) -> str:
@@ -42,5 +40,4 @@ def interval_text(value: float, ends: tuple[float, float] | list[float] | None, 
 
 
 def slots_text(right: float, unknown: float) -> str:
-    """Say which shares of the slots of a map are right, unknown and wrong."""
     return f"{right:.1%} right, {unknown:.1%} unknown, {max(1.0 - right - unknown, 0.0):.1%} wrong"

@@ -46,8 +46,6 @@ STAR = np.stack([np.cos(_TIP), np.sin(_TIP)], axis=1) * np.where(np.arange(10) %
 
 @dataclass(frozen=True, eq=False)
 class Areas:
-    """Filled polygons."""
-
     polygons: Sequence[Rings]
     color: Paint
     edge: Paint | None = None  # of their outlines
@@ -57,8 +55,6 @@ class Areas:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Lines, to scale within limits."""
-
     lines: Sequence[FloatArray]  # (k, 2) m each
     color: Paint
     width: float = 0.0  # m
@@ -106,13 +102,11 @@ def cars(
     edge: str | None = None,
     glass: str = "ink",
 ) -> list[Layer]:
-    """Return the layers of cars from above."""
     body = Marks(poses, CAR_BODY, color, size, px, edge)
     return [body, *(Marks(poses, pane, glass, size, px) for pane in (WINDSCREEN, REAR_WINDOW))]
 
 
 def posed(xy: FloatArray, yaw: FloatArray | float = 0.0) -> FloatArray:
-    """Return poses, (n, 3), from positions, (n, 2), and yaws."""
     xy = xy.reshape(-1, 2)
     return np.column_stack([xy, np.broadcast_to(yaw, len(xy))])
 
@@ -131,8 +125,7 @@ def arrows_along(lines: Sequence[FloatArray], every: float) -> FloatArray:
     for points in lines:
         for start, step in zip(points, np.diff(points, axis=0), strict=False):
             n = max(1, round(math.hypot(*step) / every))
-            yaw = math.atan2(step[1], step[0])
-            arrows += [(*(start + (i + 0.5) / n * step), yaw) for i in range(n)]
+            arrows += [(*(start + (i + 0.5) / n * step), math.atan2(step[1], step[0])) for i in range(n)]
     return np.array(arrows, dtype=np.float64).reshape(-1, 3)
 
 
@@ -148,8 +141,6 @@ def poses_on(line: FloatArray, at: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LotScene:
-    """The shapes of a lot, m, in the lot's frame."""
-
     lot: ParkingLot
     buildings: tuple[FloatArray, ...]  # outlines of buildings, (k, 2) each, closed
     walls: tuple[FloatArray, ...]  # other walls, (k, 2) each
@@ -162,7 +153,6 @@ class LotScene:
 
     @classmethod
     def of(cls, lot: ParkingLot) -> LotScene:
-        """Describe a lot."""
         corners = lot.slot_corners()
         first = np.array([0, 3, 1])[lot.slot_mouth]
         return cls(
@@ -187,11 +177,9 @@ class LotScene:
     ) -> list[Rings]:
         """Return the polygons of the asphalt, which ends at the kerbs of `DrivableArea`.
 
-        Args:
-            center: (2,); None: the whole lot.
-            reach: m, around the centre along both axes, within which the polygons are exact.
-            apron: m, width of the asphalt beyond the kerbs, on which the outer painted lines are visible.
-            joined: whether polygons must not overlap; if they may, those of a whole town are found at once.
+        They are exact within `reach`, m, around the centre along both axes; None is the whole lot. On the `apron`, m,
+        beyond the kerbs the outer painted lines are visible. Polygons that may overlap (`joined` is False) are found
+        at once for a whole town.
         """
         if center is None:
             low, high = np.array(self.lot.bounds()).reshape(2, 2)
@@ -204,17 +192,12 @@ class LotScene:
         ]
 
     def ground(
-        self,
-        center: FloatArray | None = None,
-        reach: float = math.inf,
-        *,
-        apron: float = APRON,
-        joined: bool = True,
+        self, center: FloatArray | None = None, reach: float = math.inf, *, joined: bool = True
     ) -> list[Layer]:
         """Return the layers below the slots: buildings, asphalt, walls and the marks of the lanes; see `paved`."""
         return [
             *building_layers(self.buildings, ()),
-            Areas(self.paved(center, reach, apron=apron, joined=joined), "asphalt"),
+            Areas(self.paved(center, reach, joined=joined), "asphalt"),
             *building_layers((), (*self.buildings, *self.walls)),
             Lines(self.centre_lines, "paint", 0.12, (0.5, 1.2), dash=(6.0, 8.0), opacity=0.45),
             Marks(self.arrows, LANE_ARROW, "paint", (3.2, 1.5), opacity=0.8),
@@ -237,7 +220,6 @@ class LotScene:
 
 
 def building_layers(buildings: Sequence[FloatArray], walls: Sequence[FloatArray]) -> list[Layer]:
-    """Return the layers of buildings, closed lines, and of walls."""
     return [Areas([[ring] for ring in buildings], "building"), Lines(walls, "wall", 0.3, (1.0, 4.0))]
 
 
@@ -247,26 +229,23 @@ def layer_data(layer: Layer, digits: int = 2) -> dict[str, Any]:
     if isinstance(layer, Areas):
         return data | {"areas": [[rounded(ring, digits) for ring in rings] for rings in layer.polygons]}
     if isinstance(layer, Lines):
-        dash = list(layer.dash) if layer.dash else []
         lines = [rounded(points, digits) for points in layer.lines]
-        return data | {"lines": lines, "width": layer.width, "px": layer.px[0], "dash": dash}
-    size = np.broadcast_to(np.asarray(layer.size), (1, 2))
-    shape = rounded(layer.shape * size[0])
-    return data | {
-        "marks": [rounded(pose) for pose in layer.poses],
-        "shape": shape,
-        "length": size[0, 0],
-        "px": layer.px,
-    }
+        return data | {
+            "lines": lines,
+            "width": layer.width,
+            "px": layer.px[0],
+            "dash": list(layer.dash or ()),
+        }
+    size = np.broadcast_to(np.asarray(layer.size), (1, 2))[0]
+    marks, shape = [rounded(pose) for pose in layer.poses], rounded(layer.shape * size)
+    return data | {"marks": marks, "shape": shape, "length": size[0], "px": layer.px}
 
 
 def rounded(values: FloatArray, digits: int = 2) -> list[float]:
-    """Return numbers for a page, from the first row on."""
     return [round(float(v), digits) for v in values.ravel()]
 
 
 def _entries(lot: ParkingLot) -> FloatArray:
-    """Return the entries with a yaw along their lane; on two-way lanes toward the slots."""
     lines = linestrings([lane.points for lane in lot.lanes])
     middle = lot.slot_xy.mean(axis=0)
     entries = []

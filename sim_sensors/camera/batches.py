@@ -24,8 +24,6 @@ class View(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Pixels of one kind, (n,) int32 each, and the triangles seen there."""
-
     column: Int32Array
     row: Int32Array
     triangle: Int32Array

@@ -15,7 +15,6 @@ from sim_sensors.camera.textures import VECTOR_LEAF, Single
 from sim_sensors.camera.weather import Weather
 
 Color = tuple[Single, Single, Single]
-Vector = tuple[Single, Single, Single]
 
 SHADOW_BIAS = np.float32(0.05)  # m, offset towards the sun, against self-shadowing
 
@@ -31,7 +30,6 @@ class Light(NamedTuple):
     horizon: Float32Array
     haze: Single
     wetness: Single
-    lit_windows: Single
     background: Float32Array  # (h, w, 3), the sky behind every pixel
     mirrored: NDArray[np.uint32]  # and `brightest`: the blurred sky, for `look_up`
     brightest: Single
@@ -39,7 +37,6 @@ class Light(NamedTuple):
 
 
 def daylight(weather: Weather, background: Float32Array) -> Light:
-    """Return the light of a weather; `background`, (h, w, 3) float32, is the sky of the view."""
     sun, sky = np.array(weather.sun), np.array(weather.sky)
     ground = _GROUND_TONE * (1.0 - 0.5 * weather.wetness) * (sun * weather.sun_direction[2] + sky)
     return Light(
@@ -49,7 +46,6 @@ def daylight(weather: Weather, background: Float32Array) -> Light:
         np.array(weather.horizon, dtype=np.float32),
         np.float32(weather.haze),
         np.float32(weather.wetness),
-        np.float32(weather.lit_windows),
         background,
         *packed_sky(weather),
         ground.astype(np.float32),
@@ -58,22 +54,14 @@ def daylight(weather: Weather, background: Float32Array) -> Light:
 
 @compiled(**VECTOR_LEAF)
 def mirrored(
-    px: Single,
-    py: Single,
-    pz: Single,
-    rx: Single,
-    ry: Single,
-    rz: Single,
-    light: Light,
-    maps: LightMaps,
+    px: Single, py: Single, pz: Single, rx: Single, ry: Single, rz: Single, light: Light, maps: LightMaps
 ) -> Color:
     """Return the radiance seen from a point in direction (rx, ry, rz): the sky, or the ground with its shadows."""
     red, green, blue = look_up(light.mirrored, light.brightest, rx, ry, max(rz, 0.0))
     reach = max(pz, 0.05) / max(-rz, 0.02)
     hidden = open_sky(maps, px + rx * reach, py + ry * reach)
     # Other cars, kerbs and hedges towards the horizon are darker than the open ground.
-    far = min(1.0, reach * 0.12)
-    tone = (0.25 + 0.75 * hidden) * (1.0 - 0.45 * far)
+    tone = (0.25 + 0.75 * hidden) * (1.0 - 0.45 * min(1.0, reach * 0.12))
     up = rz >= 0.0
     return (
         red if up else light.ground[0] * tone,

@@ -51,8 +51,7 @@ def color_ground(
     level = batch.depth  # which the ground no longer needs
     for i in range(n):
         # Rows change from one level to the next in a random pattern instead of a line.
-        dither = hash_unit(places.column[i], places.row[i])
-        level[i] = row_level[np.uint64(places.row[i])] + dither
+        level[i] = row_level[np.uint64(places.row[i])] + hash_unit(places.column[i], places.row[i])
     for i in range(n):
         albedo, grass, wettable = sample_ground(ground, batch.x[i], batch.y[i], np.int32(level[i]))
         # Asphalt is a warm grey, grass a yellowish green.
@@ -72,7 +71,6 @@ def color_ground(
 
 @compiled(**VECTOR_LOOP)
 def light_ground(n: int, light: Light, maps: LightMaps, batch: Batch) -> None:
-    """Turn the albedo of the first n pixels into their radiance."""
     for i in range(n):
         batch.sun[i] = sunlit(maps, batch.x[i], batch.y[i], 0.0, SHADOW_BIAS)
     for i in range(n):

@@ -23,8 +23,6 @@ _SUBPIXEL = 4  # bits of fraction in OpenCV's polygon corners
 
 
 class GroundTexture(NamedTuple):
-    """Albedo of the ground as an image pyramid, level after level, row-major, rows along y."""
-
     # (total,) from the lowest byte on: square root of the grey albedo, fraction of grass, capacity for water, 255 = 1
     texels: NDArray[np.uint32]
     start: NDArray[np.int32]  # (n_levels,) first texel of each level
@@ -148,8 +146,7 @@ def _stains(
             near = line[:2] + (line[2:4] - line[:2]) * generator.random() + generator.normal(0.0, 1.1, 2)
             center = corners(near[None, :])[0] / 2**_SUBPIXEL
         radius = max(1, round(float(generator.exponential(0.09)) / texel))
-        position = (int(center[0]), int(center[1]))
-        cv2.circle(stain, position, radius, int(generator.integers(40, 160)), -1)
+        cv2.circle(stain, (int(center[0]), int(center[1])), radius, int(generator.integers(40, 160)), -1)
     return np.asarray(cv2.GaussianBlur(stain, (0, 0), 1.6), dtype=np.uint8)
 
 

@@ -15,13 +15,13 @@ from parkenv.compiled.arrays import Float32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.rasterizer import BAND, interleaved
 from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, require_numbers
 
 _CURVE_STEPS = 4096
 _BRIGHTEST = np.float32(4.0)  # greatest input of the tone curve; a plain sRGB curve would clip at 1
 _STEPS_PER_ROOT = np.float32(
     (_CURVE_STEPS - 1) / math.sqrt(4.0)
-)  # steps of the tone curve per square root of light
+)  # of the tone curve, per square root of light
 _KNEE = 0.7  # highlights above this are compressed, as in a camera's own curve
 _NOISE = 1 << 20  # numbers in the noise table
 
@@ -51,13 +51,9 @@ class ImageSensor:
     read_noise: float = 0.0008
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise SensorError(f"{name} is {value}, want a finite number of at least 0")
-        if self.blur > 0.8:
-            raise SensorError(f"blur is {self.blur} px, want at most 0.8")
-        if self.vignetting >= 1.0:
-            raise SensorError(f"vignetting is {self.vignetting}, want below 1")
+        require_numbers(self, "mid_grey least_gain greatest_gain shot_noise read_noise", least=0.0)
+        require_numbers(self, "blur", least=0.0, most=0.8)
+        require_numbers(self, "vignetting", least=0.0, below=1.0)
         if not 0.0 < self.least_gain <= self.greatest_gain:
             raise SensorError(
                 f"least_gain {self.least_gain} and greatest_gain {self.greatest_gain} are no limits, "
@@ -72,8 +68,7 @@ class ImageSensor:
         """
         sample = radiance[::8, ::8, 1].ravel().astype(np.float64)
         middle = len(sample) // 2
-        median = np.partition(sample, middle)[middle]
-        mean = float(np.minimum(sample, 3.0 * median).mean())
+        mean = float(np.minimum(sample, 3.0 * np.partition(sample, middle)[middle]).mean())
         return min(max(self.mid_grey / max(mean, 1e-6), self.least_gain), self.greatest_gain)
 
     def expose(
@@ -134,7 +129,6 @@ def _noise_table() -> Float32Array:
 
 @lru_cache(maxsize=1)
 def _tone_curve() -> NDArray[np.int32]:
-    """Return 8-bit codes over the square root of the light: dark tones get most of the steps."""
     light = np.linspace(0.0, 1.0, _CURVE_STEPS) ** 2 * _BRIGHTEST
     over = np.maximum(light - _KNEE, 0.0)
     light = np.minimum(light, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))

@@ -15,8 +15,6 @@ from sim_sensors.mesh import MeshPool
 
 
 class LightMaps(NamedTuple):
-    """Occlusion of sun and sky."""
-
     shadow: Float32Array  # (n, n) m, height towards the sun of the nearest occluder; 0 if there is none
     to_shadow: FloatArray  # (3, 4) maps a world point (x, y, z, 1) to column, row (texels) and that height
     # (m, m) `quads` of the fraction of the sky that vehicles hide from the ground, 255 = all
@@ -74,7 +72,6 @@ def open_sky(maps: LightMaps, x: Single, y: Single) -> Single:
 
 @compiled(**VECTOR_LEAF)
 def _place(u: Single, v: Single, n: int) -> tuple[Single, Single, Single, Single, Single]:
-    """Return the texel of a map n wide at or before (u, v), the fractions to the next, and whether there is one."""
     end = np.float32(n - 1)
     covered = (u >= 0.0) & (v >= 0.0) & (u < end) & (v < end)
     u = u if covered else np.float32(0.0)

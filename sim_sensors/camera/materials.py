@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,20 +12,10 @@ from parkenv.compiled.jit import compiled
 from sim_sensors.camera.batches import Batch, Places, View
 from sim_sensors.camera.daylight import SHADOW_BIAS, Light, mirrored
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
-from sim_sensors.camera.textures import (
-    VECTOR_LEAF,
-    VECTOR_LOOP,
-    Single,
-    Tile,
-    hash_unit,
-    mix,
-    pixel_level,
-    sample_tile,
-)
+from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Single, Tile, mix, pixel_level, sample_tile
 from sim_sensors.mesh import Material
 
 _PAINT = int(Material.PAINT)
-_FACADE = int(Material.FACADE)
 _FOLIAGE = int(Material.FOLIAGE)
 _CHROME = int(Material.CHROME)
 _GLASS_TINT = 0.72  # fraction of the light that passes a pane
@@ -44,11 +33,9 @@ for _material, _row in {
     Material.PLATE: (0.02, 0.05, 0.05, 1.0),
     Material.INTERIOR: (0.0, 0.1, 0.1, 0.4),
     Material.CHROME: (0.55, 0.008, 0.02, 1.0),
-    Material.FACADE: (0.0, 0.1, 0.3, 1.0),
     Material.FOLIAGE: (0.0, 0.1, 0.9, 1.0),
     Material.BARK: (0.0, 0.1, 0.6, 1.0),
     Material.STONE: (0.0, 0.1, 0.35, 1.0),
-    Material.POST: (0.05, 0.05, 0.1, 1.0),
     Material.CLOTH: (0.0, 0.1, 0.25, 1.0),
 }.items():
     RESPONSE[_material] = _row
@@ -61,8 +48,6 @@ LINEAR = np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) 
 
 
 class Materials(NamedTuple):
-    """Lookup tables of surface appearance."""
-
     grain: Tile  # fine noise of surfaces
     cloud: Tile  # soft noise
     response: Float32Array  # see `RESPONSE`
@@ -84,7 +69,6 @@ class Surfaces(NamedTuple):
     mirror: Float32Array  # fraction of the light that is mirrored
     received: Float32Array  # fraction of the sky's light that reaches it
     glint: Float32Array  # 1 - cosine of the width of the sun's reflection
-    glow: Float32Array  # light from a window
     # vector along which mirrored light comes to the point, reversed
     mirrored_x: Float32Array
     mirrored_y: Float32Array
@@ -140,7 +124,6 @@ def color_surfaces(
         surfaces.mirror[i] = 0.0 if inside else response[material, 0]
         surfaces.glint[i] = response[material, 1]
         surfaces.received[i] = 0.4 if inside else response[material, 3]
-        surfaces.glow[i] = 0.0
         batch.red[i] = 0.05 if inside else red
         batch.green[i] = 0.05 if inside else green
         batch.blue[i] = 0.05 if inside else blue
@@ -159,60 +142,20 @@ def blotch_surfaces(n: int, cloud: Tile, focal: Single, batch: Batch, surfaces: 
 
 
 @compiled(**VECTOR_LOOP)
-def detail_walls_and_leaves(
-    n: int, focal: Single, light: Light, grain: Tile, batch: Batch, surfaces: Surfaces
-) -> None:
-    """Add windows to those of the first n pixels that are of walls, and leaves to those of foliage."""
-    detailed = np.int32(0)
+def detail_leaves(n: int, focal: Single, grain: Tile, batch: Batch, surfaces: Surfaces) -> None:
+    leafy = np.int32(0)
     for i in range(n):
-        detailed += np.int32((surfaces.material[i] == _FACADE) | (surfaces.material[i] == _FOLIAGE))
-    if detailed == 0:
+        leafy += np.int32(surfaces.material[i] == _FOLIAGE)
+    if leafy == 0:
         return
     for i in range(n):
-        footprint = batch.depth[i] / focal
-        along, z = surfaces.along[i], batch.z[i]
-        if surfaces.material[i] == _FACADE:
-            shade, surfaces.glow[i], surfaces.mirror[i] = facade(
-                along, z, surfaces.normal_z[i], footprint, light.lit_windows, grain
-            )
-            batch.red[i] *= shade
-            batch.green[i] *= shade
-            batch.blue[i] *= shade
-        elif surfaces.material[i] == _FOLIAGE:
-            u = along * 0.31 + batch.x[i] * 0.2
-            v = z * 0.31 + batch.y[i] * 0.17
-            leaf = sample_tile(grain, u, v, pixel_level(footprint * 0.3))
+        if surfaces.material[i] == _FOLIAGE:
+            u = surfaces.along[i] * 0.31 + batch.x[i] * 0.2
+            v = batch.z[i] * 0.31 + batch.y[i] * 0.17
+            leaf = sample_tile(grain, u, v, pixel_level(batch.depth[i] / focal * 0.3))
             surfaces.normal_x[i] += 1.6 * (leaf - 0.5)
             surfaces.normal_z[i] += 2.2 * (surfaces.blotch[i] - 0.5)
             surfaces.blotch[i] = 0.5 * surfaces.blotch[i] + 0.5 * leaf
-
-
-@compiled(**VECTOR_LEAF)
-def facade(
-    along: float, z: float, nz: float, footprint: float, lit_windows: float, grain: Tile
-) -> tuple[float, float, float]:
-    """Return the factor on the wall's albedo, the light from a window, and the reflectance, for storeys of windows."""
-    courses = sample_tile(grain, along * 0.4, z * 2.5, pixel_level(footprint))
-    wall = 0.7 + 0.55 * courses
-    if abs(nz) > 0.5:
-        return wall * 0.6, 0.0, 0.0
-    column = math.floor(along / 2.6)
-    storey = math.floor(z / 3.0)
-    u = along / 2.6 - column
-    v = z / 3.0 - storey
-    if not (0.22 < u < 0.78 and 0.28 < v < 0.8):
-        # A sill below each window, a joint between storeys.
-        sill = 0.2 < u < 0.8 and 0.24 < v <= 0.28
-        return wall * (1.25 if sill else (0.8 if v > 0.97 else 1.0)), 0.0, 0.0
-    if u < 0.25 or u > 0.75 or v < 0.31 or v > 0.77 or abs(u - 0.5) < 0.015:
-        return 1.5, 0.0, 0.0
-    chance = hash_unit(column, storey)
-    glow = 0.13 * (0.5 + chance / max(lit_windows, 0.01)) if chance < lit_windows else 0.0
-    # Some windows have half-closed blinds.
-    blind = hash_unit(storey + 17, column + 91)
-    if blind < 0.45 and v > 0.8 - 0.5 * blind:
-        return 0.9, 0.4 * glow, 0.04
-    return 0.12, glow, 0.12
 
 
 @compiled(**VECTOR_LOOP)
@@ -233,7 +176,6 @@ def soil_surfaces(n: int, response: Float32Array, batch: Batch, surfaces: Surfac
 
 @compiled(**VECTOR_LOOP)
 def light_surfaces(n: int, light: Light, maps: LightMaps, batch: Batch, surfaces: Surfaces) -> None:
-    """Turn the albedo of the first n pixels into the radiance that they scatter."""
     to_sun = light.sun_direction
     for i in range(n):
         nx, ny, nz = surfaces.normal_x[i], surfaces.normal_y[i], surfaces.normal_z[i]
@@ -259,7 +201,7 @@ def light_surfaces(n: int, light: Light, maps: LightMaps, batch: Batch, surfaces
 
 @compiled(**VECTOR_LOOP)
 def mirror_in_surfaces(n: int, light: Light, maps: LightMaps, batch: Batch, surfaces: Surfaces) -> None:
-    """Add to the first n pixels what they reflect of the sky and the ground, the sun's glint, and lit windows."""
+    """Add to the first n pixels what they reflect of the sky and the ground, and the sun's glint."""
     to_sun = light.sun_direction
     for i in range(n):
         strength = np.float32(0.8) if surfaces.material[i] == _PAINT else np.float32(0.5)
@@ -281,10 +223,10 @@ def mirror_in_surfaces(n: int, light: Light, maps: LightMaps, batch: Batch, surf
     for i in range(n):
         x, y, z = surfaces.mirrored_x[i], surfaces.mirrored_y[i], surfaces.mirrored_z[i]
         red, green, blue = mirrored(batch.x[i], batch.y[i], batch.z[i], x, y, z, light, maps)
-        mirror, glint, glow = surfaces.mirror[i], surfaces.glint[i], surfaces.glow[i]
-        batch.red[i] = mix(batch.red[i], red, mirror) + light.sun[0] * glint + glow
-        batch.green[i] = mix(batch.green[i], green, mirror) + light.sun[1] * glint + 0.85 * glow
-        batch.blue[i] = mix(batch.blue[i], blue, mirror) + light.sun[2] * glint + 0.6 * glow
+        mirror, glint = surfaces.mirror[i], surfaces.glint[i]
+        batch.red[i] = mix(batch.red[i], red, mirror) + light.sun[0] * glint
+        batch.green[i] = mix(batch.green[i], green, mirror) + light.sun[1] * glint
+        batch.blue[i] = mix(batch.blue[i], blue, mirror) + light.sun[2] * glint
 
 
 @compiled(**VECTOR_LOOP)
@@ -325,6 +267,5 @@ def cover_with_glass(
 
 @compiled(**VECTOR_LEAF)
 def fifth_power(x: Single) -> Single:
-    """Return x⁵, of which reflections at grazing angles grow."""
     square = x * x
     return square * square * x

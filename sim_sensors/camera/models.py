@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numba import prange
@@ -22,7 +21,7 @@ from sim_sensors.camera.shading import shade
 from sim_sensors.camera.shadows import light_maps
 from sim_sensors.camera.sky import packed_sky, sky_of_view
 from sim_sensors.camera.weather import Weather
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, require_numbers
 from sim_sensors.mesh import Ground, Instances, MeshPool
 
 _FOCAL = 520.0  # px, focal length to which `coarse_beyond` refers
@@ -79,22 +78,14 @@ class _RenderedFrame(Frame):
     ) -> None:
         self.__dict__.update(image=image, _seen=(visibility, instance, ids))
 
-    @cached_property
-    def _truth(self) -> tuple[Float32Array, Float32Array, NDArray[np.int32]]:
-        depth, glass_depth, ids = _geometry(*self.__dict__.pop("_seen"))
-        return depth, glass_depth, ids
-
-    @property
-    def depth(self) -> Float32Array:
-        return self._truth[0]
-
-    @property
-    def glass_depth(self) -> Float32Array:
-        return self._truth[1]
-
-    @property
-    def ids(self) -> NDArray[np.int32]:
-        return self._truth[2]
+    def __getattr__(self, name: str) -> Any:
+        # The truth is computed when it is first asked for.
+        if name not in ("depth", "glass_depth", "ids"):
+            raise AttributeError(name)
+        truth = _geometry(*self.__dict__["_seen"])
+        self.__dict__.update(zip(("depth", "glass_depth", "ids"), truth, strict=True))
+        self.__dict__.pop("_seen", None)
+        return self.__dict__[name]
 
 
 @dataclass(frozen=True)
@@ -106,8 +97,6 @@ class PinholeCamera:
         fx, fy: px, focal lengths.
         cx, cy: px, principal point.
         sensor: exposure, blur and noise.
-        supersampling: 1, or 2 for four samples per pixel: smoother edges at four times the cost. Depth and ids are
-            always taken at the pixel's centre.
         coarse_beyond: m, at a focal length of 520 px; objects that are smaller in the image than from there are drawn
             with coarse meshes if the pool has them.
 
@@ -122,20 +111,12 @@ class PinholeCamera:
     cx: float = 320.0
     cy: float = 240.0
     sensor: ImageSensor = field(default_factory=ImageSensor)
-    supersampling: int = 1
     coarse_beyond: float = 20.0
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise SensorError(f"image size is {self.width}×{self.height} px, want at least 1×1")
-        for name in ("fx", "fy"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise SensorError(f"{name} is {getattr(self, name)} px, want a finite number above 0")
-        for name in ("cx", "cy"):
-            if not math.isfinite(getattr(self, name)):
-                raise SensorError(f"{name} is {getattr(self, name)} px, want a finite number")
-        if self.supersampling not in (1, 2):
-            raise SensorError(f"supersampling is {self.supersampling}, want 1 or 2")
+        require_numbers(self, "width height", least=1)
+        require_numbers(self, "fx fy", above=0.0)
+        require_numbers(self, "cx cy")
         if not self.coarse_beyond >= 0.0:
             raise SensorError(f"coarse_beyond is {self.coarse_beyond} m, want at least 0")
 
@@ -210,19 +191,10 @@ class PinholeCamera:
     def _exposed(
         self, scene: Drawable, pose: FloatArray, weather: Weather, seed: int, gain: float | None
     ) -> tuple[Frame, float]:
-        """Return an image, and the exposure."""
         pose = checked_pose(scene, pose)
         triangles, seen = self.visibility(scene, pose)
         texture, maps = _surroundings(scene, scene.instances, pose, weather)
-        if self.supersampling == 1:
-            radiance = shade(triangles, seen, pose, self.intrinsics, weather, texture, maps)
-        else:
-            fine = PinholeCamera(
-                2 * self.width, 2 * self.height, 2 * self.fx, 2 * self.fy, 2 * self.cx, 2 * self.cy,
-                coarse_beyond=self.coarse_beyond / 2,
-            )  # fmt: skip
-            finer = fine.visibility(scene, pose)
-            radiance = _halved(shade(*finer, pose, fine.intrinsics, weather, texture, maps))
+        radiance = shade(triangles, seen, pose, self.intrinsics, weather, texture, maps)
         gain = self.sensor.gain(radiance) if gain is None else gain
         image = self.sensor.expose(radiance, seed, gain, rain=weather.rain)
         return _RenderedFrame(image, seen, triangles.instance, scene.instances.ids), gain
@@ -234,9 +206,7 @@ class PinholeCamera:
         # The shadows of what moves are drawn with each picture.
         still = scene.instances if scene.instances.still is None else scene.instances.still
         _surroundings(scene, still, pose, weather)
-        n = self.supersampling
-        fx, fy, cx, cy = (n * value for value in self.intrinsics)
-        sky_of_view(weather, pose[:3, :3], (fx, fy, cx, cy), (n * self.width, n * self.height))
+        sky_of_view(weather, pose[:3, :3], self.intrinsics, (self.width, self.height))
         packed_sky(weather)
 
     def visibility(self, scene: Drawable, pose: FloatArray) -> tuple[ScreenTriangles, Visibility]:
@@ -274,8 +244,7 @@ class StereoCamera:
     baseline: float = 0.12
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.baseline) and self.baseline > 0.0):
-            raise SensorError(f"baseline is {self.baseline} m, want a finite number above 0")
+        require_numbers(self, "baseline", above=0.0)
 
     def right_pose(self, pose: FloatArray) -> FloatArray:
         """Return the pose of the right camera, (4, 4), from that of the left."""
@@ -300,8 +269,7 @@ def _surroundings(
     scene: Drawable, instances: Instances, pose: FloatArray, weather: Weather
 ) -> tuple[GroundTexture, LightMaps]:
     x, y = pose[:2, 3] + _AHEAD * pose[:2, 2]
-    maps = light_maps(scene.pool, instances, weather, float(x), float(y))
-    return ground_texture(scene.ground), maps
+    return ground_texture(scene.ground), light_maps(scene.pool, instances, weather, float(x), float(y))
 
 
 def camera_pose(
@@ -335,7 +303,6 @@ def camera_pose(
 
 
 def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
-    """Return the pose as a contiguous (4, 4) float64 array."""
     pose = np.ascontiguousarray(pose, dtype=np.float64)
     if pose.shape != (4, 4):
         raise SensorError(f"camera pose has shape {pose.shape}, want (4, 4)")
@@ -363,14 +330,8 @@ def _vehicle_around(scene: Drawable, point: FloatArray) -> int:
     box = bounding_boxes(pool)[instances.mesh[near]]
     offset = point - instances.pose[near, :3]
     cosine, sine = np.cos(instances.pose[near, 3]), np.sin(instances.pose[near, 3])
-    local = np.stack(
-        [
-            cosine * offset[:, 0] + sine * offset[:, 1],
-            cosine * offset[:, 1] - sine * offset[:, 0],
-            offset[:, 2],
-        ],
-        axis=1,
-    )
+    ahead, left = cosine * offset[:, 0] + sine * offset[:, 1], cosine * offset[:, 1] - sine * offset[:, 0]
+    local = np.column_stack([ahead, left, offset[:, 2]])
     inside = ((local > box[:, :3]) & (local < box[:, 3:])).all(axis=1)
     return int(instances.ids[near[np.argmax(inside)]]) if inside.any() else 0
 
@@ -394,16 +355,3 @@ def _geometry(
             t = pane if pane >= 0 else visibility.triangle[y, x]
             seen[y, x] = ids[instance[t]] if t >= 0 else 0
     return depth, glass, seen
-
-
-@compiled(nogil=True)
-def _halved(image: Float32Array) -> Float32Array:
-    height, width, _ = image.shape
-    out = np.empty((height // 2, width // 2, 3), dtype=np.float32)
-    for y in range(height // 2):
-        for x in range(width // 2):
-            for c in range(3):
-                total = image[2 * y, 2 * x, c] + image[2 * y, 2 * x + 1, c]
-                total += image[2 * y + 1, 2 * x, c] + image[2 * y + 1, 2 * x + 1, c]
-                out[y, x, c] = np.float32(0.25) * total
-    return out

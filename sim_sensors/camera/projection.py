@@ -26,12 +26,10 @@ _MOST_PARTS = 8
 # Materials of closed objects, whose inside is never visible. A car's shell is not closed: its inside is visible through
 # the windows.
 _CLOSED = np.zeros(256, dtype=np.bool_)
-_CLOSED[[Material.RUBBER, Material.FACADE, Material.BARK, Material.STONE, Material.POST]] = True
+_CLOSED[[Material.RUBBER, Material.BARK, Material.STONE]] = True
 
 
 class ScreenTriangles(NamedTuple):
-    """The visible triangles of a scene, projected into the image."""
-
     # (n, 6) float32, px: x, y of the three corners; pixel (row, column) has its centre at (column + 0.5, row + 0.5)
     corners: Float32Array
     inverse_depth: FloatArray  # (n, 3) float64: 1/depth in 1/m at (x, y) px is a·x + b·y + c
@@ -136,8 +134,7 @@ def _visible_instances(
     seen = center[:, 2] > NEAR - reach
     # The four side planes of the frustum pass through the camera; their normals point outwards.
     for plane in ((fx, 0.0, cx - size[0]), (-fx, 0.0, -cx), (0.0, fy, cy - size[1]), (0.0, -fy, -cy)):
-        normal = np.array(plane) / np.linalg.norm(plane)
-        seen &= center @ normal < reach
+        seen &= center @ (np.array(plane) / np.linalg.norm(plane)) < reach
     return np.flatnonzero(seen).astype(np.int32)
 
 
@@ -268,13 +265,7 @@ def _move_vertices(
 
 
 @compiled(**LEAF)
-def _clip(
-    a: FloatArray,
-    b: FloatArray,
-    c: FloatArray,
-    camera: _Camera,
-    polygon: FloatArray,
-) -> int:
+def _clip(a: FloatArray, b: FloatArray, c: FloatArray, camera: _Camera, polygon: FloatArray) -> int:
     """Project the part of a triangle beyond the near plane into `polygon`, px; return its number of corners.
 
     A corner has its position in the camera frame, m, and in the image, px.

@@ -12,16 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
 from parkenv.compiled.jit import compiled
-from sim_sensors.camera.batches import (
-    BATCH_FIELDS,
-    Batch,
-    Places,
-    View,
-    fade_into_haze,
-    locate,
-    read,
-    write,
-)
+from sim_sensors.camera.batches import BATCH_FIELDS, Batch, Places, View, fade_into_haze, locate, read, write
 from sim_sensors.camera.daylight import Light, daylight
 from sim_sensors.camera.ground_shading import color_ground, ground_levels, light_ground, mirror_in_puddles
 from sim_sensors.camera.ground_texture import GroundTexture
@@ -34,7 +25,7 @@ from sim_sensors.camera.materials import (
     blotch_surfaces,
     color_surfaces,
     cover_with_glass,
-    detail_walls_and_leaves,
+    detail_leaves,
     light_surfaces,
     mirror_in_surfaces,
     orient,
@@ -156,16 +147,15 @@ def _new_batch(n: int) -> Batch:
 
 @compiled
 def _new_surfaces(n: int) -> Surfaces:
-    f = np.empty((13, n), dtype=np.float32)
+    f = np.empty((12, n), dtype=np.float32)
     material, inside = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.bool_)
     return Surfaces(
-        material, inside, f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9], f[10], f[11], f[12]
+        material, inside, f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9], f[10], f[11]
     )  # fmt: skip
 
 
 @compiled(**VECTOR_LOOP)
 def _draw_sky(inverse_depth: Float32Array, background: Float32Array, image: Float32Array) -> bool:
-    """Fill a row with the sky where there is any, and return whether there is anything else."""
     width = inverse_depth.shape[0]
     covered = np.int32(0)
     for x in range(width):
@@ -263,7 +253,7 @@ def _shade_surfaces(
     orient(n, places, triangles.normal, view, batch, surfaces)
     color_surfaces(n, places, triangles.material, triangles.color, materials, batch, surfaces)
     blotch_surfaces(n, materials.cloud, view.fx, batch, surfaces)
-    detail_walls_and_leaves(n, view.fx, light, materials.grain, batch, surfaces)
+    detail_leaves(n, view.fx, materials.grain, batch, surfaces)
     soil_surfaces(n, materials.response, batch, surfaces)
     light_surfaces(n, light, maps, batch, surfaces)
     mirror_in_surfaces(n, light, maps, batch, surfaces)

@@ -75,8 +75,7 @@ def _near(pool: MeshPool, instances: Instances, x: float, y: float) -> NDArray[n
 
 
 def _rows(instances: Instances, chosen: NDArray[np.int64]) -> FloatArray:
-    vehicle = instances.ids[chosen] > 0
-    return np.column_stack([instances.mesh[chosen], instances.pose[chosen], vehicle])
+    return np.column_stack([instances.mesh[chosen], instances.pose[chosen], instances.ids[chosen] > 0])
 
 
 def _updated(
@@ -157,8 +156,7 @@ def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
     # Seen from a low sun the window is foreshortened: its texels can be finer in that direction.
     to_shadow[1, :3] = up * (n / _WINDOW) / max(0.3, sun[2])
     to_shadow[2, :3] = sun
-    center = np.array([x, y, 0.0])
-    to_shadow[:, 3] = [n / 2, n / 2, 500.0] - to_shadow[:, :3] @ center
+    to_shadow[:, 3] = [n / 2, n / 2, 500.0] - to_shadow[:, :3] @ np.array([x, y, 0.0])
     return to_shadow
 
 

@@ -259,11 +259,7 @@ def look_up(
 
 @compiled(**VECTOR_LEAF)
 def _between(
-    corners: tuple[Single, Single, Single, Single],
-    shift: int,
-    most: int,
-    a: Single,
-    b: Single,
+    corners: tuple[Single, Single, Single, Single], shift: int, most: int, a: Single, b: Single
 ) -> Single:
     c00, c01, c10, c11 = corners
     above = mix(_code(c00, shift, most), _code(c01, shift, most), a)

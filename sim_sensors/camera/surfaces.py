@@ -76,7 +76,6 @@ class ShapeBuilder:
         self.grid(points * [1.0, -1.0, 1.0], finish, smooth=smooth)
 
     def fan(self, points: ArrayLike, finish: int, *, flip: bool = False) -> None:
-        """Add a flat convex polygon, (k, 3) m, counter-clockwise seen from outside."""
         corner = np.asarray(points, dtype=np.float64)
         if flip:
             corner = corner[::-1]
@@ -177,7 +176,9 @@ class ShapeBuilder:
         triangles = np.concatenate([t + start for t, start in zip(self._triangles, counts, strict=False)])
         finish = np.concatenate(self._finish)
         smooth = np.repeat(self._smooth, [len(t) for t in self._triangles])
-        spot = _point_numbers(points)
+        cell = np.round(points / WELD_M).astype(np.int64)
+        keys = (cell[:, 0] * 73856093) ^ (cell[:, 1] * 19349663 << 8) ^ (cell[:, 2] * 83492791 << 16)
+        spot = np.unique(keys, return_inverse=True)[1]
         corner = spot[triangles]
         doubled = np.cross(
             points[triangles[:, 1]] - points[triangles[:, 0]],
@@ -188,8 +189,7 @@ class ShapeBuilder:
         kept = distinct & (area > 1e-9)
         triangles, finish, smooth = triangles[kept], finish[kept], smooth[kept]
         doubled, area, corner = doubled[kept], area[kept], corner[kept]
-        face = doubled / area[:, None]
-        normal = _corner_normals(corner, face, area, smooth)
+        normal = _corner_normals(corner, doubled / area[:, None], area, smooth)
         rows = points[triangles.ravel()]
         packed = np.round(np.hstack([spot[triangles.ravel()][:, None] * 1.0, normal * 2048.0]))
         _, first, inverse = np.unique(_as_keys(packed), return_index=True, return_inverse=True)
@@ -207,12 +207,6 @@ def _as_keys(rows: FloatArray) -> IntArray:
     for column in columns[:, 1:].T:
         keys = keys * 8192 + column
     return np.asarray(keys)
-
-
-def _point_numbers(points: FloatArray) -> IntArray:
-    cell = np.round(points / WELD_M).astype(np.int64)
-    keys = (cell[:, 0] * 73856093) ^ (cell[:, 1] * 19349663 << 8) ^ (cell[:, 2] * 83492791 << 16)
-    return np.asarray(np.unique(keys, return_inverse=True)[1])
 
 
 @compiled

@@ -38,8 +38,7 @@ def fractal_noise(size: int, generator: np.random.Generator, slope: float) -> ND
     radius[0, 0] = 1.0
     white = np.fft.fft2(generator.standard_normal((size, size)))
     noise = np.fft.ifft2(white * radius**-slope).real
-    scaled: NDArray[np.float64] = (noise - noise.mean()) / noise.std()
-    return scaled
+    return np.asarray((noise - noise.mean()) / noise.std())
 
 
 def make_tile(image: NDArray[np.float64]) -> Tile:
@@ -98,7 +97,6 @@ def cloud_tile() -> Tile:
 
 @compiled(**VECTOR_LEAF)
 def sample_tile(tile: Tile, u: Single, v: Single, level: int) -> Single:
-    """Return the bilinear value at (u, v), in periods of the tile, at one level of its pyramid."""
     level = min(max(level, 0), tile.start.shape[0] - 1)
     n = tile.size >> level
     x = u * np.float32(n) - 0.5

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim_sensors.errors import SensorError
+from sim_sensors.errors import SensorError, require_numbers
 
 Color = tuple[float, float, float]
 
@@ -65,7 +65,6 @@ _PRESETS: dict[str, dict[str, _Drawn | float | Color]] = {
         "horizon": _Drawn(0.6, 1.0, (0.16, 0.12, 0.1)),
         "clouds": _Drawn(0.1, 0.7),
         "haze": _Drawn(0.001, 0.003),
-        "lit_windows": _Drawn(0.15, 0.5),
     },
     "rain": {
         "sun_elevation": _Drawn(0.5, 1.0),
@@ -98,7 +97,6 @@ class Weather:
         haze: 1/m, rate at which objects fade into the horizon's colour.
         wetness: from 0, dry, to 1, puddles.
         rain: from 0, none, to 1, streaks in the air.
-        lit_windows: fraction of the windows with light behind them.
         seed: seed of clouds, skyline and puddles.
 
     Raises:
@@ -116,17 +114,12 @@ class Weather:
     haze: float = 0.0008
     wetness: float = 0.0
     rain: float = 0.0
-    lit_windows: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("sun_azimuth", "sun_elevation", "haze"):
-            value = getattr(self, name)
-            if not math.isfinite(value) or (name != "sun_azimuth" and value < 0.0):
-                raise SensorError(f"{name} is {value}, want a finite number of at least 0")
-        for name in ("clouds", "wetness", "rain", "lit_windows"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise SensorError(f"{name} is {getattr(self, name)}, want a fraction from 0 to 1")
+        require_numbers(self, "sun_azimuth")
+        require_numbers(self, "sun_elevation haze", least=0.0)
+        require_numbers(self, "clouds wetness rain", least=0.0, most=1.0)
         for name in ("sun", "sky", "zenith", "horizon"):
             value = getattr(self, name)
             if len(value) != 3 or not all(math.isfinite(part) and part >= 0.0 for part in value):

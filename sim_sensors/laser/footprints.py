@@ -112,20 +112,14 @@ class CellTable:
         )
 
     def _write(
-        self,
-        place: IntArray,
-        circle: FloatArray,
-        corners: FloatArray,
-        n_corners: IntArray,
-        label: IntArray,
+        self, place: IntArray, circle: FloatArray, corners: FloatArray, n_corners: IntArray, label: IntArray
     ) -> None:
         cells = self.cells
         cells.x[place], cells.y[place], cells.radius[place] = circle[:, 0], circle[:, 1], circle[:, 2]
         cells.label[place] = label
         last = np.minimum(np.arange(cells.k), n_corners[:, None] - 1)
         local = np.take_along_axis(corners, last[..., None], 1) - circle[:, None, :2]
-        blocks = cells.corners.reshape(-1, cells.k, 2, LANES)
-        blocks[place // LANES, :, :, place % LANES] = local
+        cells.corners.reshape(-1, cells.k, 2, LANES)[place // LANES, :, :, place % LANES] = local
 
 
 class ScanPlane:
@@ -167,7 +161,7 @@ class ScanPlane:
             i = int(np.argmax(length < SHORTEST_EDGE_M))
             raise SensorError(f"walls[{i}] is {wall[i].tolist()}, want two ends apart")
         self.n_footprints, self.n_walls, self.k_max = n, len(wall), max(k_max, QUAD)
-        self._wall = wall
+        self.walls = wall  # (m, 2, 2) float64, m, world frame; read-only
         self._corners = np.zeros((n, self.k_max, 2))
         self._corners[:, :k_max], self._n_corners = _normalised("footprints", corners, count)
         self._sort()
@@ -181,11 +175,6 @@ class ScanPlane:
     def footprints(self) -> tuple[FloatArray, IntArray]:
         """Corners, (n, k_max, 2) float64, m, world frame, counter-clockwise, zero-padded; (n,) int64 counts."""
         return self._corners.copy(), self._n_corners.copy()
-
-    @property
-    def walls(self) -> FloatArray:
-        """(m, 2, 2) float64, m, world frame."""
-        return self._wall.copy()
 
     def replace(self, index: int, corners: ArrayLike | None) -> None:
         """Replace or clear a footprint; its id stays.
@@ -212,7 +201,6 @@ class ScanPlane:
             self._sort()
 
     def with_footprint(self, index: int, corners: ArrayLike | None) -> ScanPlane:
-        """Return a copy with one footprint replaced; see `replace`."""
         twin = object.__new__(ScanPlane)
         twin.__dict__.update(self.__dict__)
         twin._corners, twin._n_corners = self._corners.copy(), self._n_corners.copy()
@@ -221,7 +209,7 @@ class ScanPlane:
         return twin
 
     def _sort(self) -> None:
-        pieces = _short_pieces(self._wall)
+        pieces = _short_pieces(self.walls)
         corners = np.zeros((self.n_footprints + len(pieces), self.k_max, 2))
         corners[: self.n_footprints], corners[self.n_footprints :, :2] = self._corners, pieces
         n_corners = np.concatenate([self._n_corners, np.full(len(pieces), 2)])
@@ -283,13 +271,8 @@ def _normalised(name: str, corners: FloatArray, n_corners: IntArray) -> tuple[Fl
         outline[clockwise] = outline[clockwise, ::-1]
         edge = np.roll(outline, -1, 1) - outline
         before = np.roll(edge, 1, 1)
-        _refuse(
-            name,
-            "corners that lie apart",
-            group,
-            outline,
-            np.hypot(edge[..., 0], edge[..., 1]) < SHORTEST_EDGE_M,
-        )
+        short = np.hypot(edge[..., 0], edge[..., 1]) < SHORTEST_EDGE_M
+        _refuse(name, "corners that lie apart", group, outline, short)
         turn = np.arctan2(_cross(before, edge), (before * edge).sum(-1))
         # A convex outline turns left at every corner, by one full turn in total; an outline without area turns back.
         flat = np.abs(np.abs(turn) - np.pi) < STRAIGHT_RAD

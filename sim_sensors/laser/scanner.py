@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
 from parkenv.compiled.arrays import Float32Array
-from sim_sensors.errors import SensorError, as_floats
+from sim_sensors.errors import SensorError, as_floats, require_numbers
 from sim_sensors.laser.footprints import NO_RETURN, ScanPlane
 from sim_sensors.laser.kernel import BEAMS_PER_BLOCK, BEAMS_PER_DRAW, BeamTable, scan_all
 
@@ -60,30 +60,17 @@ class LaserScanner:
             or self.n_beams < 1
         ):
             raise SensorError(f"n_beams is {self.n_beams!r}, want an integer of 1 or more")
-        for name in ("start", "step", "max_range", "noise_sd", "dropout"):
-            value = getattr(self, name)
-            if not isinstance(value, int | float | np.number) or not math.isfinite(value):
-                raise SensorError(f"{name} is {value!r}, want a finite number")
-        if self.step <= 0 or (self.n_beams - 1) * self.step >= 2 * math.pi:
-            raise SensorError(
-                f"step is {self.step} rad, want above 0 and {self.n_beams} beams within one turn"
-            )
-        if self.max_range <= 0:
-            raise SensorError(f"max_range is {self.max_range}, want above 0 m")
-        if self.noise_sd < 0:
-            raise SensorError(f"noise_sd is {self.noise_sd}, want 0 m or more")
-        if not 0 <= self.dropout <= 1:
-            raise SensorError(f"dropout is {self.dropout}, want 0 to 1")
+        require_numbers(self, "start")
+        require_numbers(self, "step max_range", above=0.0)
+        require_numbers(self, "noise_sd", least=0.0)
+        require_numbers(self, "dropout", least=0.0, most=1.0)
+        if (self.n_beams - 1) * self.step >= 2 * math.pi:
+            raise SensorError(f"step is {self.step} rad, want {self.n_beams} beams within one turn")
 
     @cached_property
     def angles(self) -> NDArray[np.float64]:
         """(n_beams,) float64, rad, laser frame."""
         return np.asarray(self.start + self.step * np.arange(self.n_beams), dtype=np.float64)
-
-    @cached_property
-    def lost_below(self) -> np.float32:
-        """The return of a beam is lost where the noise table is below this."""
-        return np.float32(ndtri(self.dropout))
 
     @cached_property
     def _beams(self) -> BeamTable:
@@ -169,7 +156,7 @@ class LaserScanner:
             noise_table(),
             offsets,
             np.float32(self.noise_sd),
-            self.lost_below,
+            np.float32(ndtri(self.dropout)),  # a return is lost where the noise table is below this
             ranges,
             ids,
         )

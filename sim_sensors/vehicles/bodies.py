@@ -161,17 +161,14 @@ class Skin:
 
     @cached_property
     def edge(self) -> FloatArray:
-        """(c, 3) m: the shoulder, the flank's upper edge; x rises."""
         return self.flank[:, -1]
 
     def edge_between(self, low: float, high: float) -> FloatArray:
-        """Return the shoulder from x = low to x = high, m, both included, (k, 3) m."""
         edge = self.edge
         inner = edge[(edge[:, 0] > low + 0.01) & (edge[:, 0] < high - 0.01)]
         along = abs(inner[:, 1]) > 0.8 * edge[:, 1].max()
         # Straight stretches need few points: one per 0.2 m.
-        cell = np.floor(inner[:, 0] / 0.2)
-        inner = inner[~along | (np.diff(cell, prepend=-1e9) > 0)]
+        inner = inner[~along | (np.diff(np.floor(inner[:, 0] / 0.2), prepend=-1e9) > 0)]
         x = np.concatenate([[max(low, edge[0, 0])], inner[:, 0], [min(high, edge[-1, 0])]])
         return np.column_stack(
             [x, np.interp(x, edge[:, 0], edge[:, 1]), np.interp(x, edge[:, 0], edge[:, 2])]
@@ -180,8 +177,7 @@ class Skin:
     def section(self, height: float) -> FloatArray:
         """Return the section of the left flank at a height, (k, 2) m, with the wheel arches bridged."""
         z = self._uncut[..., 2]
-        crossing = (z[:, :-1] <= height) & (z[:, 1:] > height)
-        column, row = np.nonzero(crossing)
+        column, row = np.nonzero((z[:, :-1] <= height) & (z[:, 1:] > height))
         a, b = self._uncut[column, row], self._uncut[column, row + 1]
         share = (height - a[:, 2]) / (b[:, 2] - a[:, 2])
         # Along an arch's edge the sheet keeps the outline of its lower rows, which forms a lip.
@@ -210,11 +206,6 @@ def _seams(form: Form) -> list[float]:
     if form.doors == 2:
         seams.append(form.rear_axle + (0.55 if form.body != "pickup" else 1.25) * form.arch_radius)
     return seams
-
-
-def add_flanks(build: ShapeBuilder, skin: Skin) -> None:
-    """Add the sheets from sill to shoulder on both sides, with lamps, grille, seams and dirt."""
-    build.both_sides(skin.flank, flank_finish(skin))
 
 
 def flank_finish(skin: Skin) -> IntArray:
@@ -257,8 +248,7 @@ def _nose_finish(
     if form.body in ("van", "pickup") or form.variety[1] > 0.8:
         high = 0.93
     out[nose & (row > low) & (row < high) & (turn > LAMP_INNER) & (turn < LAMP_OUTER)] = Finish.HEADLAMP
-    edge = LAMP_INNER if form.variety[2] < 0.6 else GRILLE_EDGE
-    grille = nose & (turn < edge)
+    grille = nose & (turn < (LAMP_INNER if form.variety[2] < 0.6 else GRILLE_EDGE))
     bottom = 0.40 if form.variety[3] < 0.35 or form.body == "pickup" else 0.55
     out[grille & (row > bottom) & (row < 0.82)] = Finish.GRILLE
     if form.variety[3] > 0.5:
@@ -290,7 +280,6 @@ def _tail_finish(
 
 
 def add_underside(build: ShapeBuilder, skin: Skin) -> None:
-    """Add wheel wells and floor, which close the flanks from below."""
     lower = skin.flank[:, 0]
     floor = skin.form.sill + 0.03
     if skin.coarse:
@@ -327,8 +316,7 @@ def add_tail_top(build: ShapeBuilder, skin: Skin) -> None:
     if form.body == "pickup":
         _add_bed(build, skin)
         return
-    end = form.glass_end + 0.06
-    edge = skin.edge_between(-form.length, end)
+    edge = skin.edge_between(-form.length, form.glass_end + 0.06)
     crown = 0.04 * np.clip((edge[:, 0] + form.length / 2) / 0.3, 0.0, 1.0)
     crown[0] = 0.0
     across = [1, 0, -1] if skin.coarse else [1, 0.9, 0.5, 0, -0.5, -0.9, -1]
@@ -338,8 +326,7 @@ def add_tail_top(build: ShapeBuilder, skin: Skin) -> None:
 def _add_bed(build: ShapeBuilder, skin: Skin) -> None:
     form = skin.form
     start, end = skin.edge[0, 0], form.glass_end + 0.05
-    outer = skin.edge_between(-form.length, start + 0.16)
-    build.chords(outer, [1, 0.9, -0.9, -1], 0.0, Finish.BODY)
+    build.chords(skin.edge_between(-form.length, start + 0.16), [1, 0.9, -0.9, -1], 0.0, Finish.BODY)
     edge = skin.edge_between(start + 0.16, end)
     low = np.where((edge[:, 0] > start + 0.165) & (edge[:, 0] < form.glass_end - 0.03), 1.0, 0.0)
     floor = form.wheel_radius * 2 + 0.04

@@ -107,8 +107,7 @@ class Glasshouse:
 
     def _feet(self, skin: Skin, x: FloatArray, g: FloatArray) -> FloatArray:
         form, edge = self.form, skin.edge
-        inner = np.clip(x, form.glass_end, form.cowl)
-        y = np.interp(inner, edge[:, 0], edge[:, 1]) * g
+        y = np.interp(np.clip(x, form.glass_end, form.cowl), edge[:, 0], edge[:, 1]) * g
         z = np.interp(x, edge[:, 0], edge[:, 2])
         crown = np.where(x > 0, 0.060, 0.025 if form.body != "pickup" else 0.0)
         return np.column_stack([x, y, z + crown * (1 - g**2) - BASE])
@@ -156,7 +155,6 @@ class Glasshouse:
 
 
 def add_cabin(build: ShapeBuilder, skin: Skin) -> None:
-    """Add the tub below the windows: door panels, floor, bulkheads."""
     form = skin.form
     rear, front = form.glass_end + 0.05, form.cowl - 0.11
     edge = skin.edge_between(rear, front)

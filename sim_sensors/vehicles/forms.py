@@ -49,7 +49,6 @@ class Form:
 
     @property
     def pillar(self) -> float:
-        """Position x of the middle of the B pillar, between front and rear door."""
         share = 0.44 if self.doors == 1 else 0.47
         if self.body == "pickup":
             share = 0.40
@@ -71,7 +70,6 @@ _USUAL: dict[str, tuple[float, ...]] = {
 
 
 def draw_form(body: str, segment: str, size: tuple[float, float, float], rng: np.random.Generator) -> Form:
-    """Draw the proportions of a body of a given length, width and height, m."""
     length, width, height = size
     usual = np.array(_USUAL[body])
     delivery = body == "van" and segment == "N1"
@@ -81,20 +79,14 @@ def draw_form(body: str, segment: str, size: tuple[float, float, float], rng: np
     front, rear, wheel, sill, belt, nose, deck, cowl, rake, glass_end, roof_end = drawn.tolist()
     if body == "hatchback":  # small hatchbacks have their wheels at the corners
         shrink = np.clip((length - 3.45) / 0.9, 0.0, 1.0)
-        front, rear, cowl = (
-            front - 0.03 * (1 - shrink),
-            rear - 0.015 * (1 - shrink),
-            cowl - 0.025 * (1 - shrink),
-        )
-        wheel -= 0.018 * (1 - shrink)
+        front, rear = front - 0.03 * (1 - shrink), rear - 0.015 * (1 - shrink)
+        cowl, wheel = cowl - 0.025 * (1 - shrink), wheel - 0.018 * (1 - shrink)
     wheel *= 1.0 + 0.25 * (length / {"pickup": 5.3, "van": 4.7}.get(body, 4.5) - 1.0)
     half = length / 2
     variety = rng.random(8)
     boxy = {"van": 1.1, "suv": 0.5, "pickup": 0.7}.get(body, 0.0)
     header = half - cowl * length - rake
-    side_windows = 3 if body in ("estate", "suv", "van") else 2
-    if body == "hatchback" and variety[0] < 0.55:
-        side_windows = 3
+    side_windows = 3 if body in ("estate", "suv", "van") or (body == "hatchback" and variety[0] < 0.55) else 2
     if delivery and variety[0] < 0.6:  # a panel van
         side_windows = 1
     return Form(

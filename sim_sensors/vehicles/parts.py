@@ -106,7 +106,6 @@ def plate_places(skin: Skin) -> list[tuple[FloatArray, float]]:
 
 
 def add_plates(build: ShapeBuilder, skin: Skin, text: NDArray[np.int64]) -> None:
-    """Add the front and rear plate with the same dark characters, indices of glyphs."""
     for at, facing in plate_places(skin):
         _add_plate(build, at, facing, text)
 
@@ -162,8 +161,7 @@ def add_slats(build: ShapeBuilder, skin: Skin) -> None:
         row = int(np.searchsorted(ROWS, share))
         part = (share + np.array([[-0.016], [0.016]]) - ROWS[row - 1]) / (ROWS[row] - ROWS[row - 1])
         low, high = skin.flank[column:, None, row - 1], skin.flank[column:, None, row]
-        points = low + part * (high - low) + np.array([0.006, 0.0, 0.0])
-        build.both_sides(points, Finish.BRIGHT)
+        build.both_sides(low + part * (high - low) + np.array([0.006, 0.0, 0.0]), Finish.BRIGHT)
 
 
 def add_mirrors(build: ShapeBuilder, skin: Skin) -> None:

@@ -114,8 +114,7 @@ class VehicleModel:
         """
         if level not in (DETAILED, COARSE):
             raise SensorError(f"level is {level!r}, want 0 (detailed) or 1 (coarse)")
-        shape = _shape(self.painted((0, 0, 0)), level)
-        return shape.dyed(*self._palette())
+        return _shape(self.painted((0, 0, 0)), level).dyed(*self._palette())
 
     def footprint(self) -> FloatArray:
         """Return the footprint 0.5 m above the ground.
@@ -192,7 +191,7 @@ def _shape(model: VehicleModel, level: int) -> Shape:
     coarse = level == COARSE
     form, skin, build = model.form, _skin(model, coarse), ShapeBuilder()
     house = Glasshouse(skin)
-    bodies.add_flanks(build, skin)
+    build.both_sides(skin.flank, bodies.flank_finish(skin))
     bodies.add_underside(build, skin)
     bodies.add_bonnet(build, skin)
     bodies.add_tail_top(build, skin)

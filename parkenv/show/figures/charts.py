@@ -18,10 +18,8 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.show.figures.picture_files import STYLE
 
 Row = Mapping[str, Any]
-Style = Mapping[str, Any]
-"""Arguments of Matplotlib's artists."""
-Mark = Callable[[Axes], object]
-"""Something that draws itself on axes."""
+Style = Mapping[str, Any]  # arguments of Matplotlib's artists
+Mark = Callable[[Axes], object]  # something that draws itself on axes
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Colours of series, distinguishable with any colour vision."""
 GREY = "#999999"
@@ -31,8 +29,6 @@ PERCENT = PercentFormatter(1.0)
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line through points, with a band around it or an interval at each."""
-
     x: Any
     y: Any
     color: str
@@ -51,13 +47,10 @@ class Line:
 
 
 def level(y: float, color: str, **style: Any) -> Mark:
-    """Return a horizontal line across a panel."""
     return lambda ax: ax.axhline(y, color=color, **style)
 
 
 class Panel(NamedTuple):
-    """Marks on axes."""
-
     marks: Sequence[Mark]
     title: str = ""
     axes: Mapping[str, Any] = {}  # of `Axes.set`
@@ -67,7 +60,6 @@ class Panel(NamedTuple):
     title_style: Mapping[str, Any] = {}
 
     def draw(self, ax: Axes) -> None:
-        """Draw the marks on axes."""
         for mark in self.marks:
             mark(ax)
         ax.set(**self.axes)
@@ -129,7 +121,6 @@ def draw_panels(
 
 
 def legend_columns(labels: Sequence[str], width: float, most: int) -> int:
-    """Return how many columns, at most `most`, a legend of these labels may have in a width, inches."""
     length = np.array([0.5 + 0.065 * len(label) for label in labels])
     fits = (
         n
@@ -140,7 +131,6 @@ def legend_columns(labels: Sequence[str], width: float, most: int) -> int:
 
 
 def key_line(label: str, color: ColorType, **style: Any) -> Line2D:
-    """Return the handle of a line in a legend."""
     return Line2D([], [], color=color, label=label, **style)
 
 

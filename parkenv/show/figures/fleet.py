@@ -74,7 +74,6 @@ def save_fleet_figure(
 
 
 def _styles(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """Return the line of each agent."""
     return {
         agent: {"linestyle": line, "marker": marker, "markersize": 4}
         for agent, (line, marker) in zip(
@@ -84,7 +83,6 @@ def _styles(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 
 
 def _curves(rows: Sequence[Row], x: Callable[[Row], Any], y: str) -> Iterator[Line]:
-    """Yield the line of each agent and knowledge, in order of demand."""
     for agent, style in _styles(rows).items():
         for name, color in KNOWLEDGE_COLORS.items():
             if its := [row for row in rows if (row["agents"], row["knows"]) == (agent, name)]:
@@ -93,7 +91,6 @@ def _curves(rows: Sequence[Row], x: Callable[[Row], Any], y: str) -> Iterator[Li
 
 
 def _with_errors(rows: Sequence[Row], x: Callable[[Row], Any], y: str, color: str, style: Any) -> Line:
-    """Return a line with the 95 % intervals of its means."""
     mean = np.array([row[y] for row in rows])
     ends = np.array([row[f"{y}_ci95"] for row in rows], float).reshape(-1, 2).T
     more = {"linewidth": 1.2, "capsize": 2, "markersize": 4}
@@ -165,7 +162,6 @@ def _demand(rate: float | str) -> str:
 
 
 def _by_hour(rows: Sequence[Row]) -> Panel:
-    """Return occupancy by hour, simulated at each demand and as counted (dashed), of one agent, with one knowledge."""
     its = [row for row in rows if all(row[name] == rows[0][name] for name in ("agents", "knows", "share"))]
     lines: list[Any] = []
     for demand, (line, marker) in zip(
@@ -194,7 +190,6 @@ def _mark_hours(hours: Sequence[int], ax: Axes) -> None:
 def save_zones_figure(
     lot: ParkingLot, title: str, hours: Sequence[int], courses: Mapping[str, FloatArray], path: str | Path
 ) -> None:
-    """Draw the zones of a lot: where they are, how full they are by hour, and what is paid in them."""
     at = [hour + 0.5 for hour in hours]
 
     def panel(values: FloatArray, title: str, **axes: Any) -> Panel:
@@ -206,13 +201,10 @@ def save_zones_figure(
 
     with picture(path, (5.8, 6.2), f"{title}: map, slots taken and revenue by hour.") as figure:
         axes = figure.subplot_mosaic([["map", "map"], ["occupancy", "paid"]], height_ratios=(1.3, 1.0))
-        key: dict[str, Any] = {
-            "loc": "upper center",
-            "bbox_to_anchor": (0.5, 0.0),
-            "ncols": 4,
-            "frameon": False,
-        }
-        axes["map"].legend(handles=draw_zones(lot, axes["map"]), **key)
+        zones = draw_zones(lot, axes["map"])
+        axes["map"].legend(
+            handles=zones, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=4, frameon=False
+        )
         full = panel(100.0 * courses["occupancy"], "Slots taken", ylabel="%", ylim=(0.0, 100.0))
         full.draw(axes["occupancy"])
         panel(courses["paid"], "Paid an hour, when cars park", ylim=(0.0, None)).draw(axes["paid"])
@@ -220,8 +212,6 @@ def save_zones_figure(
 
 
 class CarParkDays(NamedTuple):
-    """A car park over the hours of a day."""
-
     name: str
     capacity: float
     simulated: FloatArray  # (n_hours,) cars, mean of the days of the fleet
@@ -231,7 +221,6 @@ class CarParkDays(NamedTuple):
 
 @mpl.rc_context(STYLE)
 def save_counted_demand(car_parks: Sequence[CarParkDays], hours: FloatArray, path: Path) -> None:
-    """Draw the share of the places that is taken: simulated, as counted on the days followed, and on later ones."""
     columns = min(len(car_parks), 4)
     size = 2.8 * columns + 0.6, 2.1 * -(-len(car_parks) // columns) + 0.6
     panels = []
@@ -244,8 +233,7 @@ def save_counted_demand(car_parks: Sequence[CarParkDays], hours: FloatArray, pat
             Line(hours, park.simulated / park.capacity, "#d55e00"),
         ]
         axes = {"xlim": (hours[0] - 1, hours[-1]), "ylim": (0, 1.02)}
-        name = f"{park.name}, {park.capacity:.0f}"
-        panels.append(Panel(lines, name, axes, title_style={"fontsize": 8}))
+        panels.append(Panel(lines, f"{park.name}, {park.capacity:.0f}", axes, title_style={"fontsize": 8}))
     key = [
         key_line("counted later, each day", GREY, linewidth=0.5, alpha=0.5),
         key_line("counted, days followed", "#0072b2", linestyle="--"),
@@ -328,8 +316,7 @@ def save_curves(
         panel = _panel(lines, label.partition(",")[0].capitalize(), top, label)
         panels.append(panel._replace(percent=percent))
     columns = min(len(panels), 3)
-    size = 0.6 + 3.6 * columns, 3.3 * -(-len(panels) // columns)
-    figure = draw_panels(panels, size, columns, title)
+    figure = draw_panels(panels, (0.6 + 3.6 * columns, 3.3 * -(-len(panels) // columns)), columns, title)
     save_picture(figure, path, f"{title}: curves with 95 % bands, and zones that were held out.")
 
 
@@ -344,8 +331,7 @@ def _panel(marks: Sequence[Mark], title: str, top: float, label: str) -> Panel:
 def _line(curve: Curve, name: str, color: str, label: str) -> Line:
     width = 2.2 if color == COLORS[0] else 1.2
     style: dict[str, Any] = {"marker": "o", "linewidth": width, "markersize": 3, "label": label}
-    band = curve[f"{name}_low"], curve[f"{name}_high"]
-    return Line(curve["occupancy"], curve[name], color, style, band)
+    return Line(curve["occupancy"], curve[name], color, style, (curve[f"{name}_low"], curve[f"{name}_high"]))
 
 
 def _errors(errors: Row) -> Panel:

@@ -30,8 +30,6 @@ _LEVELS = ((0.05, 0.95, 0.16), (0.25, 0.75, 0.3))
 
 
 class ShownForecast(NamedTuple):
-    """What the figure of a model shows."""
-
     model: str
     log_loss: float
     crps: float
@@ -48,7 +46,6 @@ class ShownForecast(NamedTuple):
 
 
 def shown_counts(compared: Compared, counts: Counts, week: tuple[int, int]) -> ShownForecast:
-    """Return what to show of a model of counts."""
     forecast, scores, (park, monday) = compared.forecast, compared.scores, week
     dates = counts.days[monday : monday + _WEEK]
     days = slice(monday - forecast.first, monday - forecast.first + _WEEK)
@@ -62,7 +59,6 @@ def shown_counts(compared: Compared, counts: Counts, week: tuple[int, int]) -> S
 
 
 def shown_slots(compared: ComparedSlots, log: str) -> ShownForecast:
-    """Return what to show of a model of slots: the last days that were scored, a week at most."""
     days, scores = compared.days[-_WEEK:], compared.scores
     means = scores.means()
     draws, forecast, observed = (
@@ -95,7 +91,6 @@ def shown_week(counts: Counts, first: int) -> tuple[int, int]:
 
 
 def save_forecast(shown: ShownForecast, path: Path) -> None:
-    """Draw the figure of one model."""
     with picture(path, (10.5, 5.6), f"Day-ahead forecasts of {shown.model} and what was counted") as figure:
         grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.15), width_ratios=(1.0, 1.6))
         panels = {grid[0, :]: _days(shown), grid[1, 0]: _reliability(shown), grid[1, 1]: _coverage(shown)}
@@ -188,7 +183,6 @@ def _coverage(shown: ShownForecast) -> Panel:
 
 @mpl.rc_context(STYLE)
 def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> None:
-    """Draw the mean occupancy with its spread over slots, and the profiles of both rates, for each day class."""
     hours = np.arange(0.0, 24.01, 0.25)
     full, rates = list[Any](), list[Any]()
     for name, day, color in (("weekday", 0, _BLUE), ("weekend", 5, "#e69f00")):

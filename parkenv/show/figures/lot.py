@@ -48,11 +48,9 @@ PARKING_SIGN = "#1565c0"
 """Ground of a parking sign, which marks counted facilities with their capacity."""
 MOST_SIGNS = 40  # counted facilities with signs; more are discs
 INK_PALE = "#b4b8bd"
-COST_MAP = "viridis"
-"""Colour map of parking costs."""
+COST_MAP = "viridis"  # colour map of parking costs
 MANY_MARKS = 25  # entries and goals from which on their marks are smaller
-SMALLEST_DISC = 6.0
-"""Smallest diameter of a disc, points."""
+SMALLEST_DISC = 6.0  # smallest diameter of a disc, points
 
 
 def draw_lot(
@@ -96,7 +94,6 @@ def draw_lot(
 
 
 def _draw_counted(lot: ParkingLot, ax: Axes, color: ColorType | FloatArray) -> None:
-    """Mark car parks and garages that are counted: signs with their capacity or, of many, discs of that size."""
     which = np.flatnonzero(lot.is_counted)
     x, y = lot.slot_xy[which].T
     if len(which) <= MOST_SIGNS:
@@ -111,12 +108,10 @@ def _draw_counted(lot: ParkingLot, ax: Axes, color: ColorType | FloatArray) -> N
 
 
 def drive_graph(lot: ParkingLot) -> list[Layer]:
-    """Return the layers of the drive graph: an arrow for every move, a disc for every vertex."""
     source, column = np.nonzero(lot.neighbors >= 0)
     tail, head = lot.vertex_xy[source], lot.vertex_xy[lot.neighbors[source, column]]
     step = head - tail
-    length = np.hypot(*step.T)
-    tip = ARROWHEAD_LENGTH / 2 / np.maximum(length, 1e-9)[:, None]
+    tip = ARROWHEAD_LENGTH / 2 / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
     heads = posed(head - tip * step, np.arctan2(step[:, 1], step[:, 0]))
     return [
         Lines(list(np.stack([tail, head], axis=1)), "graph", 0.18, (0.2, math.inf)),
@@ -188,21 +183,18 @@ def save_lot_picture(
 
 
 def draw_zones(lot: ParkingLot, ax: Axes, *, show_graph: bool = False) -> list[Patch]:
-    """Draw a lot with its slots in the colours of their zones; return the entries of a legend."""
     colors = zone_colors(lot)
     draw_lot(lot, ax, slot_color=to_rgba_array(colors)[lot.zone_of_slot], show_graph=show_graph)
     return [Patch(color=color, label=zone) for zone, color in zip(lot.zones, colors, strict=True)]
 
 
 def zone_colors(lot: ParkingLot) -> list[str]:
-    """Return the colour of each zone; slots without a zone are grey."""
     return [
         INK_PALE if zone == NO_ZONE else ZONE_COLORS[i % len(ZONE_COLORS)] for i, zone in enumerate(lot.zones)
     ]
 
 
 def _draw_guesses(lot: ParkingLot, ax: Axes, guesses: Sequence[str]) -> None:
-    """Mark entries and goals that an import guessed, and list all of its guesses below the lot."""
     middle = 0.5 * (lot.bounds()[0] + lot.bounds()[2])
     for start, points in (("entry", lot.entries), ("goal", lot.goals)):
         if any(guess.startswith(start) for guess in guesses):

@@ -38,8 +38,7 @@ from parkenv.show.scene import (
 from parkenv.world.lot import Lane, ParkingLot, corner_points, is_building, mouth_points
 
 TWO_WAY, ONE_WAY, TIE = "#333a42", "#aa3377", "#9aa0a6"
-ARROW_EVERY = 15.0
-"""Distance between arrows on a one-way lane, m."""
+ARROW_EVERY = 15.0  # distance between arrows on a one-way lane, m
 _TRIANGLE = np.array([[0.5, 0.0], [-0.5, 0.5], [-0.5, -0.5]])
 SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677")
 AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
@@ -52,11 +51,9 @@ SPACE_M2 = 60.0  # m² of a counted facility's disc for each place: twice the ro
 COLUMNS = 6
 WIDTH, HEIGHT, KEY = 2.8, 3.2, 0.4
 """Width and height of a lot with its caption in a contact sheet, and the height of the key, inches."""
-SCALES = (5, 10, 20, 50, 100, 200, 500)
-"""Lengths of the scale bar, m."""
+SCALES = (5, 10, 20, 50, 100, 200, 500)  # lengths of the scale bar, m
 LONGEST_NAME = 28
-LARGEST = 60
-"""Number of lots in one sheet."""
+LARGEST = 60  # number of lots in one sheet
 KIND_COLORS = {"perpendicular": "#0072b2", "oblique": "#e69f00", "kerbside": "#009e73", "mixed": "#8c8c8c"}
 _EDGES_AN_OCTAVE = 2
 
@@ -140,7 +137,6 @@ def save_import_picture(draft: LotDraft, path: str | Path) -> None:
 
 
 def _ground(figure: Figure, box: Any, low: FloatArray, high: FloatArray, fontsize: int) -> Axes:
-    """Return axes on the ground, m, between two corners."""
     ax = figure.add_axes(box)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor=GROUND)
     ax.tick_params(labelsize=fontsize)
@@ -150,7 +146,6 @@ def _ground(figure: Figure, box: Any, low: FloatArray, high: FloatArray, fontsiz
 
 @mpl.rc_context(STYLE)
 def save_town_picture(town: TownDraft, path: str | Path) -> None:
-    """Draw a town to a PNG file: slots are dots, counted facilities discs by capacity, hollow where a rule says it."""
     draft = town.draft
     points = np.concatenate([lane.points for lane in draft.lanes])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -209,26 +204,10 @@ def _draw_town(town: TownDraft, ax: Axes, points_per_m: float) -> None:
     share = total / max(float(total.max(initial=0.0)), 1e-9)
     traffic = next(iter(draft.entry_weights.values()), np.ones(len(draft.entries)))
     edge: dict[str, Any] = {"linewidths": 0.5, "zorder": 5}
-    _dots(
-        ax,
-        draft.goals,
-        s=12.0 + 90.0 * share,
-        marker="*",
-        color=GOAL,
-        edgecolors="none",
-        label="goals",
-        **edge,
-    )
-    _dots(
-        ax,
-        draft.entries,
-        s=20.0 + 6.0 * traffic,
-        marker="^",
-        color=ENTRY,
-        edgecolors=INK,
-        label="entries",
-        **edge,
-    )
+    goals: dict[str, Any] = {"marker": "*", "color": GOAL, "edgecolors": "none", "label": "goals"}
+    _dots(ax, draft.goals, s=12.0 + 90.0 * share, **goals, **edge)
+    entries: dict[str, Any] = {"marker": "^", "color": ENTRY, "edgecolors": INK, "label": "entries"}
+    _dots(ax, draft.entries, s=20.0 + 6.0 * traffic, **entries, **edge)
 
 
 def _dots(ax: Axes, xy: FloatArray, **style: Any) -> None:
@@ -292,8 +271,7 @@ def _draw_small(ax: Axes, lot: ParkingLot) -> None:
     (x, y), half = (low + high) / 2 - [0.0, 0.04 * extent], extent / 2
     up = half * box.height / box.width
     ax.set(xlim=(x - half, x + half), ylim=(y - up, y + up), aspect="equal")
-    layers = _schematic(corners, SLOT, lot.mouth_xy(), lot.lanes, lot.entries, lot.goals, small=True)
-    paint(ax, layers, 1.0)
+    paint(ax, _schematic(corners, SLOT, lot.mouth_xy(), lot.lanes, lot.entries, lot.goals, small=True), 1.0)
     length = max((step for step in SCALES if step < 0.4 * extent), default=SCALES[0])
     bar_y = low[1] - 0.08 * extent
     ax.plot([low[0], low[0] + length], [bar_y, bar_y], color=INK, linewidth=1.5, solid_capstyle="butt")
@@ -301,7 +279,6 @@ def _draw_small(ax: Axes, lot: ParkingLot) -> None:
 
 
 def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
-    """Draw how many lots there are of each size and kind, their drive times, and how sure they are."""
     lots, slots = plural(len(rows), "lot"), np.array([row["slots"] for row in rows], float)
     kinds = list(KIND_COLORS)[:-1]
     present = [kind for kind in KIND_COLORS if kind in {row["kind"] for row in rows}]

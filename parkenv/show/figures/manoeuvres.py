@@ -35,7 +35,6 @@ Shown = tuple[Scene, Mapping[str, Any], str]
 
 
 def save_sheet(pictures: Sequence[Image], path: Path) -> None:
-    """Write frames, (480, 640, 3) each, as one PNG, two a row."""
     sheet = np.full((-(-len(pictures) // 2), 2, HEIGHT + GAP, WIDTH + GAP, 3), 255, dtype=np.uint8)
     for i, frame in enumerate(pictures):
         sheet[i // 2, i % 2, :HEIGHT, :WIDTH] = frame
@@ -45,7 +44,6 @@ def save_sheet(pictures: Sequence[Image], path: Path) -> None:
 
 
 def save_manoeuvres(shown: Sequence[Shown], path: Path) -> None:
-    """Write a PNG of manoeuvres, two a row."""
     save_sheet(
         [_frame(scene, _states(scene, driven), f"{scene.name}: {says}") for scene, driven, says in shown],
         path,
@@ -71,7 +69,6 @@ def save_manoeuvre_film(
 
 
 def _states(scene: Scene, driven: Mapping[str, Any]) -> FloatArray:
-    """Return the states of a trajectory, (n, 6), in the scene's coordinates."""
     columns = [driven[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps", "steering_rad")]
     states = np.zeros((len(columns[0]), STATE_SIZE))
     states[:, :5] = np.column_stack(columns)
@@ -82,7 +79,6 @@ def _states(scene: Scene, driven: Mapping[str, Any]) -> FloatArray:
 def _frame(
     scene: Scene, states: FloatArray, text: str, whole: FloatArray | None = None, users: Sequence[Any] = ()
 ) -> Image:
-    """Render what was driven in a scene so far, (480, 640, 3) uint8 RGB, and `users`; the view fits `whole`."""
     whole = states if whole is None else whole
     poses = np.concatenate([whole[:: max(1, len(whole) // 200), :3], scene.target[None]])
     corners = scene.vehicle.corners(poses).reshape(-1, 2)
@@ -100,7 +96,6 @@ def _frame(
 
 
 def _ground(scene: Scene) -> list[Layer]:
-    """Return the target and, darkest of all, the obstacles."""
     goal = scene.vehicle.corners(scene.target)
     solid = [s for s in scene.shapes if s.geom_type == "Polygon"]
     lines = [shapely.get_coordinates(s) for s in scene.shapes if s.geom_type != "Polygon"]

@@ -17,8 +17,7 @@ from PIL import Image
 from parkenv.files.atomic_write import atomic_write
 
 DPI = 150
-CAPTION = "Description"
-"""Key of the caption in the metadata of a PNG."""
+CAPTION = "Description"  # key of the caption in the metadata of a PNG
 # All settings, so that none of a user's `matplotlibrc` are left, which may want LaTeX.
 STYLE: dict[Any, Any] = {
     **{name: value for name, value in mpl.rcParamsDefault.items() if name not in ("backend", "interactive")},
@@ -55,7 +54,6 @@ def picture(
 
 
 def save_picture(figure: Figure, path: str | Path, caption: str = "") -> None:
-    """Write a PNG atomically."""
     with mpl.rc_context(STYLE), atomic_write(path) as beside:
         figure.savefig(beside, format="png", dpi=DPI, metadata={CAPTION: caption} if caption else None)
 
@@ -89,7 +87,6 @@ def save_film(
 
 
 def _palette(image: NDArray[np.uint8], n: int) -> Image.Image:
-    """Return a palette of n colours: the most frequent ones exactly, and others that cover the rest."""
     picture = Image.fromarray(image)
     counted: Any = picture.getcolors(picture.width * picture.height)
     frequent = [color for _, color in sorted(counted, key=lambda seen: (-seen[0], seen[1]))[: n // 2]]

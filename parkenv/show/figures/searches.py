@@ -31,8 +31,7 @@ from parkenv.world.lot import PARK, ParkingLot
 from parkenv.world.scenario import KMH
 
 PATH, WALK = hex_color("car"), hex_color("goal")
-POLICY_SCALE = 2.2
-"""Least scale, points per metre, at which arrows at every vertex are legible."""
+POLICY_SCALE = 2.2  # least scale, points per metre, at which arrows at every vertex are legible
 
 
 def draw_search(record: SearchRecord, ax: Axes) -> None:
@@ -54,7 +53,6 @@ def draw_search(record: SearchRecord, ax: Axes) -> None:
 
 
 def _title(record: SearchRecord, width: float) -> str:
-    """Describe the search, with lines broken to a width in inches at the current font size."""
     scenario, metrics = record.scenario, record.metrics
     terms = [
         f"{metrics[term.field]:.0f} {term.label}"
@@ -122,13 +120,11 @@ def _draw_policy(lot: ParkingLot, policy: NDArray[np.int64], path: list[int], ax
 
 
 def _text_marker(text: str) -> MplPath:
-    """Return bold text as a marker; markers of mathematical text would need it in names, too."""
     path = TextPath((0, 0), text, prop=FontProperties(weight="bold"))
     return path.transformed(Affine2D().translate(*-path.get_extents().get_points().mean(axis=0)))
 
 
 def draw_searches(records: Sequence[SearchRecord]) -> Figure:
-    """Draw searches of several agents or settings in the same world side by side."""
     if not records:
         raise InputError("no search to draw")
     bounds = np.array([record.scenario.lot.bounds() for record in records])
@@ -162,7 +158,6 @@ def draw_searches(records: Sequence[SearchRecord]) -> Figure:
 
 
 def _draw_key(figure: Figure, height: float, zoom: float, *, policy: bool) -> None:
-    """Draw the legend along the lower edge."""
     disc: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 8 * zoom}
     disc |= {"markeredgecolor": INK, "markeredgewidth": 0.5}
     cased = [Stroke(linewidth=3.8, foreground=INK), Normal()]

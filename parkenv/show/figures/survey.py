@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import matplotlib as mpl
@@ -36,17 +36,11 @@ from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import VehicleBoxes, View
 from sim_sensors.rig import Capture, SensorRig
 
-if TYPE_CHECKING:
-    from parkenv.perception.detection_scores import TestSetScore
-
 VIEW_COLORS = {view: PALETTE[view.name.lower()] for view in View}
 UNRANGED_COLOR = (200, 200, 200)
-NEAREST, FARTHEST = 2.0, 30.0
-"""Limits of the depth colour scale, m."""
-SEEN = 0.05
-"""Least visible fraction of a vehicle for its box to be drawn."""
-HIDDEN = 0.8
-"""Visible fraction below which it is written beside the probability."""
+NEAREST, FARTHEST = 2.0, 30.0  # limits of the depth colour scale, m
+SEEN = 0.05  # least visible fraction of a vehicle for its box to be drawn
+HIDDEN = 0.8  # visible fraction below which it is written beside the probability
 TAKEN, FREE, UNKNOWN = BELIEF_MAP(1.0), BELIEF_MAP(0.0), "#b9bec4"
 WRONG = hex_color("wrong")
 PATH_COLOR, CAR_COLOR, SLOT_COLOR = "#0072b2", "#d55e00", "#7030aa"
@@ -79,7 +73,6 @@ def draw_detections(
 
 
 def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
-    """Return a copy of an image, (h, w, 3) RGB, with the boxes of visible vehicles, farthest first."""
     drawn = image.copy()
     for i in np.flatnonzero(boxes.visible_fraction >= SEEN)[::-1]:
         corners, view = boxes.visible_box[i] - [0, 0, 1, 1], View(boxes.view[i])
@@ -98,7 +91,6 @@ def _draw_box(image: Image, corners: Sequence[int], color: Color, thickness: int
 def save_sensor_preview(
     lot: ParkingLot, rig: SensorRig, capture: Capture, boxes: VehicleBoxes, title: str, path: Path
 ) -> None:
-    """Draw the camera frame with true boxes, its depth, the stereo disparity and the scan from above."""
     frame = capture.images[rig.cameras[0][0]]
     name, stereo, _ = rig.stereo_cameras[0]
     with picture(path, (10.6, 8.4), layout=None) as figure:
@@ -122,7 +114,6 @@ def save_sensor_preview(
 
 
 def _draw_scan(ax: Axes, lot: ParkingLot, capture: Capture, rig: SensorRig) -> None:
-    """Draw the lot from above with the vehicle and the end points of its beams."""
     draw_lot(lot, ax)
     x, y, yaw = capture.pose
     for name, laser, mount in rig.lasers:
@@ -138,7 +129,6 @@ def _draw_scan(ax: Axes, lot: ParkingLot, capture: Capture, rig: SensorRig) -> N
 
 
 def save_detections(result: SessionResult, path: Path) -> None:
-    """Draw some frames of a session with their detections (T Fig. 4.4)."""
     n = len(result.shown)
     caption = "Camera frames of a survey drive, with the cars that were detected"
     with picture(path, (4.2 * n, 3.7), caption, layout=None) as figure:
@@ -164,7 +154,6 @@ def save_detections(result: SessionResult, path: Path) -> None:
 def _lots(
     lot: ParkingLot, panels: int, path: Path, caption: str, *, room: float = 0.0
 ) -> Iterator[Sequence[Axes]]:
-    """Yield axes for pictures of a lot, one below the other, and write them to a file."""
     x0, y0, x1, y1 = lot.bounds()
     height = 11.0 * (y1 - y0 + 8.0) / (x1 - x0 + 8.0) * 0.92 + 0.45
     with picture(path, (11.0, panels * height + room), caption) as figure:
@@ -172,7 +161,6 @@ def _lots(
 
 
 def _draw_lot(lot: ParkingLot, ax: Axes, layers: Sequence[Layer], title: str, *key: Any) -> None:
-    """Draw layers on a lot, with a title and a legend."""
     draw_lot(lot, ax)
     paint(ax, layers, 3.0)
     ax.set_title(title)
@@ -180,7 +168,6 @@ def _draw_lot(lot: ParkingLot, ax: Axes, layers: Sequence[Layer], title: str, *k
 
 
 def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
-    """Draw a session from above (T Fig. 4.5): grid, detected cars and slots."""
     caption = "One survey drive: occupancy grid, detected cars, and the states of the slots"
     with _lots(lot, 3, path, caption) as axes:
         above, middle, below = axes
@@ -207,13 +194,11 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
 
 
 def headings(poses: FloatArray, color: str, length: float = 2.5) -> Lines:
-    """Return a line through each of some cars, (n, 3), along its heading, `length` m."""
     ahead = 0.5 * length * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
     return Lines(list(np.stack([poses[:, :2] - ahead, poses[:, :2] + ahead], axis=1)), color, px=(1.3, 1.3))
 
 
 def save_localisation(lot: ParkingLot, result: SessionResult, path: Path) -> None:
-    """Draw the path and the located cars of a session by its odometry, and as corrected."""
     cars = result.session.cars
     by_odometry = [
         moved(result.odometry[i], between(result.poses[i], car))
@@ -257,7 +242,6 @@ def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, pa
 
 
 def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, path: Path) -> None:
-    """Draw the slots discovered from the cars of all sessions over the true slots."""
     with _lots(lot, 1, path, "Slots discovered from detected cars, without a map of the lot") as (ax,):
         slots = posed(found.xy, found.yaw)
         layers: list[Layer] = [headings(slots, SLOT_COLOR, 4.0), Marks(slots, DISC, SLOT_COLOR, px=3.0)]
@@ -271,7 +255,6 @@ def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, 
 
 
 def save_detection_reach(rows: Sequence[Row], title: str, path: Path) -> None:
-    """Draw detection rates by weather and distance, rows of `surveys.detection_by_distance`."""
     weathers, marks = list(dict.fromkeys(row["weather"] for row in rows)), list[Any]()
     for i, weather in enumerate(weathers):
         of_weather = [row for row in rows if row["weather"] == weather]
@@ -283,15 +266,8 @@ def save_detection_reach(rows: Sequence[Row], title: str, path: Path) -> None:
         low, high = np.array([row["rate_ci95"] for row in of_weather]).T
         style = {"marker": "o", "markersize": 4, "linewidth": 1.6, "label": weather.replace("_", " ")}
         marks.append(Line(x, [row["rate"] for row in of_weather], color, style))
-        ends: dict[str, Any] = {
-            "x": x,
-            "ymin": low,
-            "ymax": high,
-            "color": color,
-            "linewidth": 1.2,
-            "alpha": 0.7,
-        }
-        marks.append(partial(Axes.vlines, **ends))
+        ends: dict[str, Any] = {"x": x, "ymin": low, "ymax": high, "color": color}
+        marks.append(partial(Axes.vlines, **ends, linewidth=1.2, alpha=0.7))
     axes = {
         "xlabel": "distance from the camera to the middle of the car, m; points in the middle of ranges",
         "xticks": sorted({end for row in rows for end in row["distance_m"]}),
@@ -302,21 +278,7 @@ def save_detection_reach(rows: Sequence[Row], title: str, path: Path) -> None:
     save_picture(figure, path, "How often a car in the frame is detected, by weather and distance")
 
 
-def save_recall_precision(scores: Sequence[TestSetScore], title: str, path: Path) -> None:
-    """Plot recall against 1 - precision of a detector, as in the papers on UIUC's sets."""
-    with picture(path, (5.4, 4.4), layout=None) as figure:
-        ax = figure.subplots()
-        for score in scores:
-            label = f"{score.row['test_set']}-scale: equal error at {score.row['eer']:.1%}"
-            ax.plot(1.0 - score.curve.precision, score.curve.recall, label=label)
-        ax.plot([0.0, 1.0], [1.0, 0.0], color="0.7", linewidth=0.8, linestyle=":")
-        ax.set(xlim=(0.0, 0.3), ylim=(0.7, 1.005), xlabel="1 - precision", ylabel="recall", title=title)
-        ax.legend(loc="lower right")
-        figure.tight_layout()
-
-
 def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, title: str, path: Path) -> None:
-    """Draw the map's prediction for every slot (T Fig. 4.6), and the true probabilities if known."""
     panels: list[tuple[str, str, Colormap, FloatArray]] = [
         ("what the map says", "P(taken)", BELIEF_MAP, predicted.p_occupied)
     ]
@@ -334,7 +296,6 @@ def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, ti
 
 
 def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
-    """Draw the slot filter's states, with a bright outline around wrong ones."""
     states, wrong = result.states, (result.states.occupied != result.truth) & result.states.in_view
     color = np.array([to_rgb(TAKEN if o else FREE) for o in states.occupied])
     color[~states.in_view] = to_rgb(UNKNOWN)

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
@@ -60,14 +60,11 @@ AGENT_COLORS = {
 }
 """Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol)."""
 _OTHERS = ("#5c4a3d", "#a6761d", "#6a3d9a", "#1b7a8c", "#b15928")
-OFF_SCALE = 3.0
-"""Totals above this multiple of the median are cut off, so that they do not compress the rest."""
+OFF_SCALE = 3.0  # totals above this multiple of the median are cut off, so that they do not compress the rest
 BOUND = "clairvoyant lower bound"
-_AXIS_END = 2.5
-"""The axis of a distribution ends at this multiple of the median."""
+_AXIS_END = 2.5  # the axis of a distribution ends at this multiple of the median
 _TOTAL = "mean total time, s; 95 % interval"
-Totals = Mapping[str, FloatArray]
-"""Total times of each agent, (n_episodes,) s, by name."""
+Totals = Mapping[str, FloatArray]  # total times of each agent, (n_episodes,) s, by name
 
 
 def agent_color(agent: str) -> str:
@@ -76,7 +73,6 @@ def agent_color(agent: str) -> str:
 
 @mpl.rc_context(STYLE)
 def draw_time_split(rows: Sequence[Row]) -> Figure:
-    """Draw mean total times: a panel per setting, a bar per agent, split into drive, failed attempts and walk."""
     limit = _limit(rows)
     settings: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
@@ -137,7 +133,6 @@ def _draw_split(rows: Sequence[Row], limit: float, ax: Axes) -> None:
 
 
 def _draw_break(ax: Axes, y: float, limit: float) -> None:
-    """Mark a truncated bar with two slanted lines near its end."""
     slant = np.array([[-0.008, 0.46], [0.008, -0.46]])
     for at in (0.925, 0.95):
         xy = np.array([at, y]) + slant
@@ -145,7 +140,6 @@ def _draw_break(ax: Axes, y: float, limit: float) -> None:
 
 
 def draw_time_against_occupancy(rows: Sequence[Row], about: str = "") -> Figure:
-    """Draw the total time against occupancy: a panel per failure cost, a line per agent."""
     limit = _limit(rows)
     panels = [
         _lines(
@@ -163,21 +157,16 @@ def draw_time_against_occupancy(rows: Sequence[Row], about: str = "") -> Figure:
 
 
 def draw_time_against_failure_cost(observed: Sequence[Row], blind: Sequence[Row]) -> Figure:
-    """Draw the total time against the failure cost, with and without observations of slots before an attempt."""
-
     def panel(rows: Sequence[Row], title: str) -> Panel:
         last = max(row["failure_cost_s"] for row in rows)
         ticks = [tick for tick in (0, 1, 2, 5, 10, 20, 50, 100) if tick <= last]
-        labels: dict[str, Any] = {
-            "xlabel": "failure cost, s (in the world and in the planners' models)",
-            "ylabel": _TOTAL,
-        }
         axes: dict[str, Any] = {
             "xlim": (0.0, 1.08 * last),
             "xticks": ticks,
-            "xticklabels": [str(tick) for tick in ticks],
+            "xticklabels": [*map(str, ticks)],
         }
-        lines = _lines(rows, lambda row: float(row["failure_cost_s"]), title, _limit(rows), **axes, **labels)
+        axes |= {"xlabel": "failure cost, s (in the world and in the planners' models)", "ylabel": _TOTAL}
+        lines = _lines(rows, lambda row: float(row["failure_cost_s"]), title, _limit(rows), **axes)
         return lines._replace(marks=[*lines.marks, _scale_by_decades])
 
     panels = [
@@ -194,7 +183,6 @@ def _scale_by_decades(ax: Axes) -> None:
 
 
 def draw_time_against_map(rows: Sequence[Row], own: Sequence[Row], forecast: Mapping[str, float]) -> Figure:
-    """Draw the total time against a forecast that is the same for every slot."""
     title = "dashed: with the scenario's own forecast"
     labels = {"xlabel": "forecast P(taken) of every slot, %", "ylabel": _TOTAL}
     lines = _lines(rows, lambda row: 100.0 * forecast[row["scenario"]], title, _limit(rows), **labels)
@@ -227,7 +215,6 @@ def _lines(
 
 
 def _name_ends(ends: Sequence[tuple[float, float, str]], limit: float, ax: Axes) -> None:
-    """Name lines, in ascending order of their ends, beside the axes."""
     heights = spread([min(total / limit, 1.0) for total, *_ in ends], 0.062)
     for (total, x, agent), height in zip(ends, heights, strict=True):
         color, off = agent_color(agent), total > limit
@@ -237,58 +224,6 @@ def _name_ends(ends: Sequence[tuple[float, float, str]], limit: float, ax: Axes)
             textcoords="axes fraction", va="center", color=color, weight="bold", fontsize=8.5,
             arrowprops=None if off else link, annotation_clip=False,
         )  # fmt: skip
-
-
-def draw_time_against_decision_time(panels: Mapping[str, Sequence[Row]]) -> Figure:
-    """Draw the total time against that of a decision: a panel per scenario, a line per planner but the oracles."""
-    panels = {name: [row for row in rows if row["agent"] not in UNBEATEN] for name, rows in panels.items()}
-    planners = list(dict.fromkeys(row["planner"] for rows in panels.values() for row in rows))
-    if not planners:
-        raise InputError("no rows to draw")
-    columns = min(len(panels), 4)
-    width = max(3.0 * columns, 4.6)
-    keys = legend_columns(planners, width, min(len(planners), 2 + columns))
-    colors = {planner: agent_color(planner.partition("(")[0]) for planner in planners}
-    key = [key_line(name, color, linewidth=2.0, marker="o") for name, color in colors.items()]
-
-    def marks(rows: Sequence[Row]) -> Iterator[Any]:
-        # The first planner lies on top of the others.
-        for order, planner in enumerate(reversed(planners)):
-            own = sorted(
-                (row for row in rows if row["planner"] == planner), key=lambda row: row["decision_ms"]
-            )
-            x, total = (np.array([row[name] for row in own]) for name in ("decision_ms", "total_s"))
-            low, high = np.array([_interval(row) for row in own], dtype=np.float64).reshape(-1, 2).T
-            style = {
-                "linewidth": 1.8, "marker": "o", "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0,
-                "zorder": 2.0 + 0.01 * order,
-            }  # fmt: skip
-            color = colors[planner]
-            yield Line(x, total, color, style, interval=np.array([total - low, high - total]))
-            if len(own) == 1:  # it takes no longer for more
-                below: dict[str, Any] = {
-                    "linestyle": (0, (1, 2)),
-                    "linewidth": 1.0,
-                    "zorder": 1.0 + 0.01 * order,
-                }
-                yield level(total[0], color, **below)
-        yield _scale_by_log
-
-    size = width, 2.7 * -(-len(panels) // columns) + 0.2 * -(-len(planners) // keys)
-    return draw_panels(
-        [
-            Panel(list(marks(rows)), f"{name}{_each([row['episodes'] for row in rows])}", {}, "y", title_style=BOLD)
-            for name, rows in panels.items()
-        ],
-        size, columns, share="x", label={"x": "time of a decision, ms", "y": _TOTAL}, key=key,
-        key_style={"ncols": keys, "columnspacing": 1.4},
-    )  # fmt: skip
-
-
-def _scale_by_log(ax: Axes) -> None:
-    ax.set(xscale="log")
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.xaxis.set_minor_formatter(NullFormatter())
 
 
 @mpl.rc_context(STYLE)
@@ -350,8 +285,7 @@ def _limit(rows: Sequence[Row]) -> float:
     if not rows:
         raise InputError("no rows to draw")
     total = np.array([row["total_s"] for row in rows])
-    near = total[total <= OFF_SCALE * np.median(total)]
-    return float(1.12 * near.max()) or 1.0
+    return float(1.12 * total[total <= OFF_SCALE * np.median(total)].max()) or 1.0
 
 
 def _interval(row: Row) -> tuple[float, float]:
@@ -375,8 +309,7 @@ def _each(searches: Sequence[int]) -> str:
 FIXED, NONE = "fixed", "none"
 """Column `map` of the references: a right map that does not learn; an agent that uses no map."""
 _WORDS = {"empty": "empty map at first", "right": "right map at first", "wrong": "wrong map at first"}
-_DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))
-"""Lines of an agent with different options."""
+_DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))  # lines of an agent with different options
 _FIXED_LINE: dict[str, Any] = {"linewidth": 1.2, "linestyle": (0, (1, 1))}
 _INK = "#444444"
 _NONE_LINE: dict[str, Any] = {"linewidth": 1.4, "linestyle": (0, (4, 2))}
@@ -461,7 +394,6 @@ def _excess(learned: Sequence[Row], others: Sequence[Row]) -> tuple[list[Mark], 
 
 
 def _bands(rows: Sequence[Row], measure: str) -> Iterator[Line]:
-    """Yield the line of a measure of each learning agent, with its 95 % interval."""
     for agent, dashes in _dashes(rows).items():
         its = [row for row in rows if row["agent"] == agent]
         low, high = np.array([row[f"{measure}_ci95"] for row in its], float).T
@@ -475,7 +407,6 @@ def _color(agent: str) -> str:
 
 
 def _dashes(rows: Sequence[Row]) -> dict[str, Any]:
-    """Return the line of each agent: agents of one colour have different ones."""
     colors = {row["agent"]: _color(row["agent"]) for row in rows}
     alike = {color: [agent for agent in colors if colors[agent] == color] for color in colors.values()}
     return {agent: _DASHES[alike[color].index(agent) % len(_DASHES)] for agent, color in colors.items()}
@@ -483,8 +414,7 @@ def _dashes(rows: Sequence[Row]) -> dict[str, Any]:
 
 TRAINING_COLORS = (*COLORS, "#555555")
 """Colours of trainings: as many as are easy to tell apart."""
-OFF_CURVES = 2.0
-"""Times above this multiple of the lowest are cut off."""
+OFF_CURVES = 2.0  # times above this multiple of the lowest are cut off
 _NAMES_APART = 0.045  # least distance of two labels, fraction of the axis
 _MARGIN_IN = 0.12  # beside the labels, inches
 

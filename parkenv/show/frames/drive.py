@@ -17,6 +17,7 @@ from parkenv.show.colors import FREE, mixed_color
 from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, painted_finely, strip, write_line
 from parkenv.show.frames.window import Window
 from parkenv.show.painters.opencv import MapView, paint
+from parkenv.show.plurals import plural
 from parkenv.show.scene import SQUARE, Areas, Layer, Lines, LotScene, Marks, building_layers, cars
 from parkenv.world.lot import ParkingLot, corner_points
 
@@ -31,8 +32,6 @@ _NOSE = np.array([[0.5, 0.0], [-0.3, 0.55], [-0.1, 0.0], [-0.3, -0.55]])
 
 
 class DriveRenderer:
-    """Renderer of parking manoeuvres on one lot, to scale."""
-
     def __init__(self, lot: ParkingLot) -> None:
         self._scene = LotScene.of(lot)
         self._task: ParkingTask | None = None
@@ -40,7 +39,6 @@ class DriveRenderer:
         self.window = Window(f"parkenv: driving on {lot.name}")
 
     def frame(self, state: DriveState, outlines: Sequence[FloatArray] = ()) -> Image:
-        """Render the current state, (480, 640, 3) uint8 RGB."""
         task = state.task
         if task is not self._task:
             self._task, self._center = task, None
@@ -75,7 +73,6 @@ class DriveRenderer:
 
 
 def _movers(poses: FloatArray, outlines: Sequence[FloatArray]) -> list[Layer]:
-    """Return the layers of moving cars and people, distinguished by their size."""
     layers: list[Layer] = []
     for outline, pose in zip(outlines, poses, strict=False):
         size = np.ptp(outline, axis=0)
@@ -86,7 +83,6 @@ def _movers(poses: FloatArray, outlines: Sequence[FloatArray]) -> list[Layer]:
 
 
 def steered_car(vehicle: VehicleParameters, state: FloatArray) -> list[Layer]:
-    """Return the layers of a car with its steered wheels."""
     axles = ((0.0, 0.0), (vehicle.wheelbase, float(state[STEERING])))
     side = 0.5 * vehicle.width - 0.02
     wheels = [
@@ -115,7 +111,6 @@ def trail(vehicle: VehicleParameters, poses: FloatArray) -> list[Layer]:
 
 
 def _ground(scene: LotScene, task: ParkingTask) -> list[Layer]:
-    """Return everything static: the lot around the task's slot, the slot, and the obstacles, dark on a light floor."""
     lot, own = scene.lot, _box(task)
     near = np.abs(lot.slot_xy - task.slot[:2]).max(axis=1) < REACH
     layers = [
@@ -135,7 +130,6 @@ def _ground(scene: LotScene, task: ParkingTask) -> list[Layer]:
 
 
 def _parked(outline: FloatArray) -> list[Layer]:
-    """Return a parked car from its footprint, with equal windows at both ends."""
     box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shapely.Polygon(outline)))
     side = np.diff(box[:3], axis=0)
     length, width = np.hypot(side[:, 0], side[:, 1]).tolist()
@@ -146,7 +140,6 @@ def _parked(outline: FloatArray) -> list[Layer]:
 
 
 def _line(state: DriveState) -> Image:
-    """Return the line of text below the map."""
     image, task = strip(), state.task
     way = "" if task.kind == "parallel" else f", {task.way}"
     parts = (
@@ -154,25 +147,20 @@ def _line(state: DriveState) -> Image:
         f"{state.time:.1f} s",
         f"{3.6 * abs(float(state.vehicle[SPEED])):.1f} km/h",
     )
+    verdicts: tuple[str, ...] = ()
     if state.parked:
-        n = state.direction_changes
-        write_line(image, parts, (f"parked, {n} direction change{'' if n == 1 else 's'}", "parked"))
+        verdicts = f"parked, {plural(state.direction_changes, 'direction change')}", "parked"
     elif state.contact:
         left = state.contact.startswith("left")
-        write_line(
-            image, parts, (state.contact if left else f"touched a {state.contact}", "contact"), "warning"
-        )
-    else:
-        write_line(image, parts)
+        verdicts = state.contact if left else f"touched a {state.contact}", "contact"
+    write_line(image, parts, verdicts, "car" if state.parked else "warning")
     return image
 
 
 def _box(task: ParkingTask) -> FloatArray:
-    """Return the corners, (4, 2) m, of the task's slot."""
     x, y, yaw = task.slot
     length, width = (np.array([side]) for side in task.size)
-    corners: FloatArray = corner_points(np.array([[x, y]]), np.array([yaw]), length, width)[0]
-    return corners
+    return np.asarray(corner_points(np.array([[x, y]]), np.array([yaw]), length, width)[0])
 
 
 def _closed(points: FloatArray) -> FloatArray:

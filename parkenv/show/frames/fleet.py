@@ -18,8 +18,6 @@ SMALLEST_CAR = 7.0  # length, px
 
 
 class FleetRenderer:
-    """Renderer of a fleet: the whole lot, cars that search (yellow), those that have parked (blue), and others."""
-
     def __init__(self, fleet: Fleet) -> None:
         self.fleet = fleet
         self._frames = LotFrames(fleet.scenario.lot, smallest_slot=0.0)
@@ -45,7 +43,6 @@ class FleetRenderer:
 
 
 def _key() -> Image:
-    """Return the background of the line of text, with the key of colours."""
     image = strip()
     x = float(image.shape[1] - HUD_MARGIN)
     for text, color in (("parked", "resident"), ("searching", "car")):

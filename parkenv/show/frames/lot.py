@@ -48,8 +48,7 @@ SMALLEST_SLOT = 4.0
 """Slot width, px, below which a frame shows a window around the car instead of the whole lot."""
 WINDOW_SLOT = 9.0  # width, px, of a slot in such a window
 LARGEST_SCALE = 22.0  # largest scale, px/m, so that a small lot does not fill the frame
-PIXELS = MapView(np.eye(2), 1.0, np.zeros(2))
-"""For layers in pixels."""
+PIXELS = MapView(np.eye(2), 1.0, np.zeros(2))  # for layers in pixels
 
 _LINE_WIDTH = 0.14  # m, paint between slots
 _EDGE = 3.0  # m, around the lot's features
@@ -57,20 +56,12 @@ _CAR_EDGE, _NEAR = 0.12, 8.0  # m; px/m from which parked cars have a light edge
 
 
 def clock(time: float) -> str:
-    """Weekday and time of day.
-
-    Examples:
-        >>> clock(86400.0 + 34867.0)
-        'Tue 09:41:07'
-    """
     day, second = divmod(int(time), int(DAY_S))
     return f"{DAY_NAMES[day % 7].title()} {second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}"
 
 
 @dataclass(frozen=True, eq=False)
 class StillLayer:
-    """The static background of the frames, and the pixels of the slots."""
-
     view: MapView  # map view of the frame
     image: Image  # (height, width, 3) uint8, the image without slots
     slots: NDArray[np.int64]  # (m,) int64, the slots in the image
@@ -87,7 +78,6 @@ class LotFrames:
     Ground, slots and cars are drawn once at high resolution; a picture then only mixes colours, so its cost does not
     grow with the number of slots. If slots would be less than `smallest_slot` px wide, a picture shows a window around
     a place, which moves in steps of half its size.
-
     """
 
     def __init__(
@@ -99,29 +89,23 @@ class LotFrames:
     ) -> None:
         self.size, self._scene = size, LotScene.of(lot)
         self._still: StillLayer | None = None
-        self._window_at: tuple[int, int] | None = None
+        self._window_at = np.zeros(2)
         slot_width = float(np.median(np.minimum(lot.slot_width, lot.slot_length)))
         self._scale = WINDOW_SLOT / slot_width
         fitted = MapView.fit(lot_corners(lot), size, LARGEST_SCALE, MARGIN)
         self.whole = fitted if fitted.scale * slot_width >= smallest_slot else None
 
     def still(self, place: FloatArray) -> StillLayer:
-        """Return the static layer of the whole lot, or of the window around a place, (2,) m."""
-        if self.whole is not None:
-            if self._still is None:
-                self._still = draw_still_layer(self._scene, self.whole, self.size)
-            return self._still
         # The window depends only on the place: equal states give equal frames.
         stride = np.array(self.size) / self._scale / 2
-        column, row = np.round(place / stride).astype(int)
-        if self._still is None or self._window_at != (column, row):
-            self._window_at = column, row
-            view = MapView.around(np.array([column, row]) * stride, self.size, self._scale)
+        at = np.zeros(2) if self.whole is not None else np.round(place / stride)
+        if self._still is None or (at != self._window_at).any():
+            self._window_at = at
+            view = self.whole or MapView.around(at * stride, self.size, self._scale)
             self._still = draw_still_layer(self._scene, view, self.size)
         return self._still
 
     def slots(self, place: FloatArray, colors: Image, taken: NDArray[np.bool_]) -> Image:
-        """Return a picture of the lot."""
         still = self.still(place)
         image = still.image.copy()
         _paint_slots(
@@ -142,7 +126,6 @@ def _paint_slots(
     colors: Image,
     taken: NDArray[np.bool_],
 ) -> None:
-    """Paint the slots of a `StillLayer` into its flattened image, (k, 3) uint8; see its fields."""
     for i in range(len(pixel)):
         s, p = slot[i], pixel[i]
         for c in range(3):
@@ -153,7 +136,6 @@ def _paint_slots(
 
 
 def lot_corners(lot: ParkingLot) -> FloatArray:
-    """Return two opposite corners, (2, 2) m, of what a frame of the whole lot shows."""
     low_x, low_y, high_x, high_y = lot.bounds()
     return np.array([[low_x - _EDGE, low_y - _EDGE], [high_x + _EDGE, high_y + _EDGE]])
 
@@ -165,20 +147,17 @@ def painted_finely(
     ground: str = "ground",
     times: int = SUPERSAMPLING,
 ) -> Image:
-    """Paint layers at so many times the resolution; return that image, not yet averaged."""
     image = np.full((size[1] * times, size[0] * times, 3), PALETTE[ground], dtype=np.uint8)
     paint(image, view.finer(times), layers)
     return image
 
 
 def draw_still_layer(scene: LotScene, view: MapView, size: tuple[int, int]) -> StillLayer:
-    """Draw everything static at `SUPERSAMPLING` times the resolution, and average it down."""
     width, height = size
     lot, fine = scene.lot, view.finer()
     at = view(lot.slot_xy)
     reach = view.scale * float(np.hypot(lot.slot_length, lot.slot_width).max()) / 2
-    inside = (at > -reach).all(axis=1) & (at < np.array(size) + reach).all(axis=1)
-    slots = np.flatnonzero(inside)
+    slots = np.flatnonzero((at > -reach).all(axis=1) & (at < np.array(size) + reach).all(axis=1))
     poses = posed(lot.slot_xy[slots], lot.slot_yaw[slots])
     slot_size = np.stack([lot.slot_length, lot.slot_width], axis=1)[slots]
 
@@ -222,7 +201,6 @@ def draw_still_layer(scene: LotScene, view: MapView, size: tuple[int, int]) -> S
 
 
 def _blocks(fine: NDArray[Any]) -> NDArray[Any]:
-    """Group the fine pixels by pixel, (rows, columns, SUPERSAMPLING ** 2)."""
     rows, columns = fine.shape[0] // SUPERSAMPLING, fine.shape[1] // SUPERSAMPLING
     split = fine.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING)
     return split.swapaxes(1, 2).reshape(rows, columns, SUPERSAMPLING**2)
@@ -275,7 +253,6 @@ def write_line(
 
 
 def strip(height: int = HUD, width: int = WIDTH) -> Image:
-    """Return an empty line of text."""
     return np.full((height, width, 3), PALETTE["ink"], np.uint8)
 
 

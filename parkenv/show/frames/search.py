@@ -37,8 +37,6 @@ TEXT_CELL_LEAST, TEXT_CELL = 1.25, 3.5
 
 
 class SearchRenderer:
-    """Renderer of the searches in one scenario."""
-
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.frames = LotFrames(scenario.lot)
@@ -68,7 +66,6 @@ class SearchRenderer:
         return np.vstack([image, self._line(state)])
 
     def _line(self, state: SearchState) -> Image:
-        """Return the line of text below the map."""
         image = self._key.copy()
         parts = (clock(state.time), f"{state.total_s:.0f} s", f"{state.failed_parks} failed")
         if state.parked:
@@ -134,19 +131,16 @@ class SearchRenderer:
         put(lot.entries, np.full(len(lot.entries), "E"))
         put(lot.goals[[self.scenario.goal]], np.array(["G"]))
         pose = car_pose(self.scenario, state.path, parked=state.parked)
-        quarter = round(float(view.yaw(pose[2])) / (np.pi / 2)) % 4
-        put(pose[None, :2], np.array([">v<^"[quarter]]))
+        put(pose[None, :2], np.array([">v<^"[round(float(view.yaw(pose[2])) / (np.pi / 2)) % 4]]))
         return ["".join(row).rstrip() for row in rows]
 
 
 def _price_and_walk(state: SearchState) -> str:
-    """Return what parking costs, where it costs something, and the walk."""
     price = f"price {state.parking_cost_s:.0f} s, " if state.parking_cost_s else ""
     return f"{price}{state.walk_s:.0f} s to walk"
 
 
 def _strip_with_key() -> Image:
-    """Return an empty line of text with the key of the colours of beliefs at the right, `_KEY_WIDTH` px wide."""
     image = strip()
     top, right = HUD // 2 - 6, image.shape[1] - HUD_MARGIN
     write_label(image, "taken", (right - 18.0, top + 6.0), "white", 13, 400)
@@ -156,7 +150,6 @@ def _strip_with_key() -> Image:
 
 
 def car_pose(scenario: Scenario, path: Sequence[int], *, parked: bool) -> FloatArray:
-    """Return the car's pose, (3,): x, y, m, and yaw, at the last vertex of its path or in its slot."""
     lot, vertex = scenario.lot, path[-1]
     if parked:
         return np.array([*lot.slot_xy[vertex], lot.slot_yaw[vertex]])
@@ -167,23 +160,19 @@ def car_pose(scenario: Scenario, path: Sequence[int], *, parked: bool) -> FloatA
 
 
 def searching_car(pose: FloatArray) -> list[Layer]:
-    """Return the layers of the searching car; a small one is larger than to scale, to stay visible."""
     return cars(pose[None], "car", px=17.0, edge="ink")
 
 
 def view_range(scenario: Scenario, pose: FloatArray) -> Layer:
-    """Return the circle around the car within which it observes slots."""
     circle = pose[:2] + 2.0 * scenario.sensor_model.view_range * DISC
     return Lines([np.vstack([circle, circle[:1]])], "white")
 
 
 def walk(slot: FloatArray, goal: FloatArray) -> Layer:
-    """Return the walk from a slot to the goal, (2,) m each."""
     return Lines([np.stack([slot, goal])], "goal", px=(2.0, 2.0), dash=(4.5, 4.5))
 
 
 def fading_trail(path: FloatArray) -> Layer:
-    """Return the driven path, (k, 2) m, brighter where it is newer."""
     ages = np.linspace(0, len(path) - 1, min(len(path), 25)).astype(int)
     pieces = [path[first : last + 1] for first, last in pairwise(ages)]
     colors = [mixed_color("asphalt", "car", 0.35 + 0.65 * (i + 1) / len(pieces)) for i in range(len(pieces))]
@@ -191,7 +180,6 @@ def fading_trail(path: FloatArray) -> Layer:
 
 
 def _fitting(words: list[str], width: int) -> str:
-    """Join as many words as fit, and the number of the others."""
     for n in range(len(words), 0, -1):
         text = ", ".join(words[:n]) + (f", +{len(words) - n}" if n < len(words) else "")
         if len(text) <= width:
@@ -200,10 +188,8 @@ def _fitting(words: list[str], width: int) -> str:
 
 
 def _way_in(lot: ParkingLot, vertex: int) -> FloatArray:
-    """Return the unit vector, (2,), of the edge out of a vertex that points most directly toward the slots."""
     ahead = lot.vertex_xy[lot.neighbors[vertex][lot.neighbors[vertex] >= 0]] - lot.vertex_xy[vertex]
     if not len(ahead):
         return np.array([1.0, 0.0])
     ahead /= np.hypot(ahead[:, 0], ahead[:, 1])[:, None]
-    best: FloatArray = ahead[np.argmax(ahead @ (lot.slot_xy.mean(axis=0) - lot.vertex_xy[vertex]))]
-    return best
+    return np.asarray(ahead[np.argmax(ahead @ (lot.slot_xy.mean(axis=0) - lot.vertex_xy[vertex]))])

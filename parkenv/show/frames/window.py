@@ -12,8 +12,6 @@ from parkenv.errors import needs_extra
 
 
 class Window:
-    """A window that opens with the first frame."""
-
     def __init__(self, title: str) -> None:
         self._title = title
         self._screen: Any = None
@@ -41,7 +39,6 @@ class Window:
         self._ticker.tick(fps)
 
     def close(self) -> None:
-        """Close the window, if open."""
         if self._screen is not None:
             import pygame
 

@@ -57,7 +57,6 @@ def _outline(polygon: Rings) -> Outline:
 
 
 def _paint(color: Paint) -> Any:
-    """Return a colour, or one for each shape, as Matplotlib knows it."""
     if isinstance(color, str):
         return _paint(PALETTE[color]) if color in PALETTE else color
     if isinstance(color, tuple) and all(isinstance(part, int) for part in color):
@@ -66,14 +65,12 @@ def _paint(color: Paint) -> Any:
 
 
 def points_per_m(ax: Axes) -> float:
-    """Return the size of a metre, points, in axes with an equal aspect ratio."""
     box = ax.get_window_extent()
     across, down = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
     return float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
 
 
 def draw_scale_bar(ax: Axes, x: float, y: float, width: float, ink: str) -> None:
-    """Draw a scale bar of a round length, about a sixth of `width` m, with its lower left corner at (x, y)."""
     power = 10.0 ** np.floor(np.log10(width / 6))
     length = power * max(step for step in (1, 2, 5) if step * power <= width / 6)
     thickness = 0.005 * width

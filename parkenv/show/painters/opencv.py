@@ -48,28 +48,22 @@ class MapView:
     def around(
         cls, center: FloatArray, size: tuple[float, float], scale: float, *, turned: bool = False
     ) -> Self:
-        """Centre the image on a point, (2,) m."""
         turn = np.array([[0.0, 1.0], [1.0, 0.0]] if turned else [[1.0, 0.0], [0.0, -1.0]])
         return cls(turn, scale, np.array(size) / 2 - center @ turn * scale)
 
     def __call__(self, xy: FloatArray) -> FloatArray:
         """Pixels, (..., 2), x right and y down, of points, (..., 2) m."""
-        pixels: FloatArray = xy @ self.turn * self.scale + self.shift
-        return pixels
+        return np.asarray(xy @ self.turn * self.scale + self.shift)
 
     def yaw(self, yaw: FloatArray) -> FloatArray:
-        """Return directions, rad, in the image, where y points down."""
         ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1) @ self.turn
-        angle: FloatArray = np.arctan2(ahead[..., 1], ahead[..., 0])
-        return angle
+        return np.asarray(np.arctan2(ahead[..., 1], ahead[..., 0]))
 
     def finer(self, times: int = SUPERSAMPLING) -> MapView:
-        """Return the view of an image with so many times the resolution, to be averaged down."""
         return MapView(self.turn, times * self.scale, times * self.shift, times)
 
 
 def paint(image: Image, view: MapView, layers: Sequence[Layer]) -> None:
-    """Paint layers in order on an image, (h, w, 3) uint8 RGB."""
     for layer in layers:
         below = image.copy() if layer.opacity < 1.0 else None
         if isinstance(layer, Areas):
@@ -120,7 +114,6 @@ def _paint_lines(image: Image, view: MapView, layer: Lines) -> None:
 
 
 def _dashes(pixels: FloatArray, on: float, off: float) -> FloatArray:
-    """Return dashes, (n, 2, 2) px, along a line; the last one ends with the line."""
     along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(pixels, axis=0).T))]
     n = max(1, round((along[-1] + off) / (on + off)))
     start = (on + off) * np.arange(n) * (along[-1] + off) / (n * (on + off))
@@ -142,12 +135,10 @@ def _paint_marks(image: Image, view: MapView, layer: Marks) -> None:
 
 
 def _colors(color: Paint, n: int) -> list[Color]:
-    """Return the colour of each of n shapes."""
     return [rgb(color)] * n if _is_one(color) else [rgb(each) for each in color]
 
 
 def _is_one(color: Paint) -> bool:
-    """Whether all shapes have one colour."""
     return isinstance(color, str) or (isinstance(color, tuple) and isinstance(color[0], int))
 
 
@@ -158,20 +149,17 @@ def _line_type(view: MapView) -> int:
 
 def fixed_point(pixels: FloatArray) -> NDArray[np.int32]:
     """Convert pixels to OpenCV's fixed-point numbers, whose pixel centres are integers."""
-    fixed: NDArray[np.int32] = np.round((pixels - 0.5) * 2**SUBPIXEL_BITS).astype(np.int32)
-    return fixed
+    return np.asarray(np.round((pixels - 0.5) * 2**SUBPIXEL_BITS).astype(np.int32))
 
 
 def write_text(
     image: Image, text: str, at: tuple[int, int], color: str | Color, size: int, weight: int
 ) -> int:
-    """Write text from a point on the baseline; returns its right end, px."""
     (right, _), _ = cv2.putText(image, text, at, rgb(color), FONT, size, weight)
     return int(right)
 
 
 def write_tag(image: Image, text: str, at: tuple[int, int], color: Color) -> None:
-    """Write dark text on a coloured ground with its upper left corner at a point."""
     left, top = at
     end = left + 8 + text_width(text, 13, 600)
     cv2.rectangle(image, at, (end, top + 20), color, cv2.FILLED)
@@ -179,7 +167,6 @@ def write_tag(image: Image, text: str, at: tuple[int, int], color: Color) -> Non
 
 
 def text_width(text: str, size: int, weight: int) -> int:
-    """Return the width of a text, px."""
     _, _, width, _ = cv2.getTextSize((1 << 14, 1 << 14), text, (0, 0), FONT, size, weight)
     return int(width)
 
@@ -194,7 +181,6 @@ def write_label(
     *,
     halo: bool = False,
 ) -> None:
-    """Write text centred at a point, kept inside the image."""
     width = text_width(text, size, weight)
     left = int(np.clip(round(at[0] - width / 2), 2, image.shape[1] - width - 2))
     base = round(at[1] + 0.36 * size)

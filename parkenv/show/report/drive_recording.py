@@ -18,14 +18,11 @@ from parkenv.perception.pipeline import CameraView, PerceptionResult
 from parkenv.show.scene import LotScene
 from sim_sensors.rig import poses_along
 
-PICTURE_WIDTH = 480
-"""Width of recorded camera frames, px."""
+PICTURE_WIDTH = 480  # width of recorded camera frames, px
 JPEG_QUALITY = 68
-SCAN_REACH = 16.0
-"""Maximum length of recorded beams, m."""
+SCAN_REACH = 16.0  # maximum length of recorded beams, m
 MOST_FRAMES = 120
-LEVELS = 15
-"""Shades of the occupancy grid."""
+LEVELS = 15  # shades of the occupancy grid
 
 Recording = dict[str, Any]
 
@@ -33,7 +30,6 @@ Recording = dict[str, Any]
 def record_drive(
     survey: Survey, number: int, pictures: int = 0, most_frames: int = MOST_FRAMES
 ) -> tuple[SessionResult, Recording]:
-    """Drive a session of a survey, and record it."""
     captures = len(poses_along(survey.route.path, survey.settings.every))
     step = max(1, math.ceil(captures / most_frames))
     frames: list[Recording] = []
@@ -106,14 +102,13 @@ def _frame(frame: SurveyFrame, first_time: float) -> Recording:
 def _boxes(view: CameraView) -> list[list[float]]:
     """List, per box: left, top, right, bottom as fractions of the image; probability; is a front or rear; is ranged."""
     height, width = view.image.shape[:2]
-    found = view.detections
-    made = []
-    for i in range(len(found)):
-        left, top, right, bottom = found.boxes[i].tolist()
-        box = (left / width, top / height, right / width, bottom / height, float(found.probability[i]))
-        placed = int(i in view.cars.detection)
-        made.append([*(round(v, 3) for v in box), int(found.end_on[i]), placed])
-    return made
+    boxes = []
+    for i, (left, top, right, bottom) in enumerate(view.detections.boxes.tolist()):
+        p = float(view.detections.probability[i])
+        box = (left / width, top / height, right / width, bottom / height, p)
+        end_on, ranged = int(view.detections.end_on[i]), int(i in view.cars.detection)
+        boxes.append([*(round(v, 3) for v in box), end_on, ranged])
+    return boxes
 
 
 def _scan(result: PerceptionResult) -> list[int]:
@@ -129,7 +124,6 @@ def _scan(result: PerceptionResult) -> list[int]:
 
 
 def _changes(before: NDArray[np.int64], now: NDArray[np.int64]) -> list[int]:
-    """List the changed entries, slot and new value alternating."""
     changed = np.flatnonzero(before != now)
     pairs: list[int] = np.stack([changed, now[changed]], axis=1).ravel().tolist()
     return pairs
@@ -144,7 +138,6 @@ def _jpeg(image: NDArray[np.uint8]) -> str:
 
 
 def _grid_png(grid: OccupancyGrid) -> str:
-    """Encode the grid as a PNG, north up, at half resolution: 0 for unobserved, then from free to taken."""
     rows, columns = (2 * (n // 2) for n in grid.log_odds.shape)
     blocks = (rows // 2, 2, columns // 2, 2)
     p = grid.probability[:rows, :columns].reshape(blocks).max(axis=(1, 3))
@@ -157,18 +150,12 @@ def _grid_png(grid: OccupancyGrid) -> str:
     return data_uri("image/png", content.getvalue())
 
 
-def _palette() -> list[int]:
-    """Build the palette: transparent, then from pale blue to dark violet."""
-    share = np.linspace(0.0, 1.0, LEVELS)[:, None]
-    colors = np.array([[150, 190, 215]]) * (1 - share) + np.array([[112, 48, 170]]) * share
-    return [0, 0, 0, *np.round(colors).astype(int).ravel().tolist()]
-
-
-_PALETTE = _palette()
+_COLORS = np.linspace([150.0, 190.0, 215.0], [112.0, 48.0, 170.0], LEVELS)
+_PALETTE = [0, 0, 0, *np.round(_COLORS).astype(int).ravel().tolist()]
+"""Transparent, then from pale blue to dark violet."""
 _OPACITY = bytes([0, *np.round(np.linspace(50, 235, LEVELS)).astype(int).tolist()])
 """Opacity of each colour: slots are visible through free cells."""
 
 
 def data_uri(kind: str, content: bytes) -> str:
-    """Encode a file's content as a data URI."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

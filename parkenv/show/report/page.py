@@ -22,8 +22,7 @@ from parkenv.world.cost_terms import COST_TERMS
 
 Row = Mapping[str, Any]
 
-FORMAT, VERSION = "parkenv-report", 1
-"""JSON schema of the data in a page."""
+FORMAT, VERSION = "parkenv-report", 1  # JSON schema of the data in a page
 SCRIPTS = (
     "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_track.js",
     "search_replay.js", "drive_replay.js", "fleet_replay.js", "town_map.js", "page.js",
@@ -31,10 +30,8 @@ SCRIPTS = (
 """Scripts of the page, in order of dependence."""
 GAME_SCRIPTS = ("numbers.js", "lot_view.js", "player.js", "search_track.js", "game_search.js", "game.js")
 """Scripts of a game's page."""
-MOST_WIDTH = 1800
-"""px; wider figures are scaled down."""
-LOSSLESS = 150_000
-"""Bytes above which a figure is compressed lossily."""
+MOST_WIDTH = 1800  # px; wider figures are scaled down
+LOSSLESS = 150_000  # bytes above which a figure is compressed lossily
 _QUALITY = 86
 _HERE = Path(__file__).parent
 _ORDER = (
@@ -42,15 +39,12 @@ _ORDER = (
     "searches", "session", "detections", "slots_found", "reach", "graph", "map", "learning_curve",
 )  # fmt: skip
 """The first figures of a page: prefixes of their file names."""
-_WIDE = 2.2
-"""Least ratio of width to height of a figure that has the page to itself, such as charts in a row."""
+_WIDE = 2.2  # least ratio of width to height of a figure that has the page to itself, such as charts in a row
 _WHITE = 0.5
 """Least white share of a chart, which is inverted in dark mode; pictures of lots and photographs are not."""
 
 
 class Page(NamedTuple):
-    """What a study says about a run."""
-
     title: str
     findings: Sequence[str] = ()  # a line each
     tables: Sequence[Mapping[str, Any]] = ()  # from `tables.table_of`
@@ -64,24 +58,19 @@ def page_data(
     recordings: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Build the data of a page, without the figures.
+    """Build the data of a page of a run of some kind (compare, survey, ...), without the figures.
 
-    Args:
-        kind: kind of the run: compare, survey, demo, train, ...
-        page: what is said about it.
-        summary: its `command`, `version` and `seed`.
-        recordings: what is replayed: a `lot`, and on it a `world` with searches, a `drive`, or a day of a `fleet`; or a
-            `town`, and a `map` of its day.
-        notes: notes for the reader, such as why there is no replay.
+    A recording is replayed: it has a `lot`, and on it a `world` with searches, a `drive`, or a day of a `fleet`; or a
+    `town`, and a `map` of its day. Notes say, for instance, why there is no replay.
     """
     grounds: dict[str, list[Any]] = {"lot": [], "town": []}
 
     def placed(name: str, on: str = "lot") -> list[dict[str, Any]]:
-        found = [recording for recording in recordings if name in recording]
-        for recording in found:
+        of_kind = [recording for recording in recordings if name in recording]
+        for recording in of_kind:
             if recording[on] not in grounds[on]:
                 grounds[on].append(recording[on])
-        return [{**recording[name], on: grounds[on].index(recording[on])} for recording in found]
+        return [{**recording[name], on: grounds[on].index(recording[on])} for recording in of_kind]
 
     return {
         "format": FORMAT,
@@ -113,31 +102,27 @@ def terms_data() -> list[dict[str, Any]]:
 
 
 def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()) -> None:
-    """Write the page atomically."""
     shown = "\n".join(_figure(f) for f in sorted(figures, key=_rank))
     _write(path, "page.html", data, SCRIPTS, title=html.escape(data["run"]["title"]), figures=shown)
 
 
 def write_game(data: Mapping[str, Any], path: Path) -> None:
     """Write the page of a game atomically; see `parkenv.studies.play.game_data`."""
-    _write(path, "game.html", data, GAME_SCRIPTS, game=(_HERE / "game.css").read_text(encoding="utf-8"))
+    _write(path, "game.html", data, GAME_SCRIPTS, game=_part("game.css"))
 
 
 def _write(path: Path, page: str, data: Mapping[str, Any], scripts: Iterable[str], **parts: str) -> None:
     # A "<" in a string must not end the script element that holds the data.
     embedded = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    text = Template((_HERE / page).read_text(encoding="utf-8")).substitute(
-        style=(_HERE / "style.css").read_text(encoding="utf-8") + _term_colors(),
-        data=embedded,
-        program="\n".join((_HERE / name).read_text(encoding="utf-8") for name in scripts),
-        **parts,
-    )
-    write_text(path, text)
+    style, program = _part("style.css") + _term_colors(), "\n".join(map(_part, scripts))
+    write_text(path, Template(_part(page)).substitute(style=style, data=embedded, program=program, **parts))
+
+
+def _part(name: str) -> str:
+    return (_HERE / name).read_text(encoding="utf-8")
 
 
 def _term_colors() -> str:
-    """Return the style sheet of the colours of the costs: a variable for each term, `--gave-up` for `gave_up`."""
-
     def variables(colors: Iterable[str]) -> str:
         return " ".join(
             f"--{term.name.replace('_', '-')}: {color};"
@@ -168,7 +153,6 @@ def _figure(path: Path) -> str:
 
 
 def _webp(picture: PillowImage.Image, *, chart: bool) -> str:
-    """Encode as WebP: charts lossless if the result is small, everything else lossy."""
     content = io.BytesIO()
     if chart:
         picture.save(content, "WEBP", lossless=True)
@@ -207,9 +191,8 @@ def on_scenarios(rows: Sequence[Row], most: int = 4) -> str:
         >>> on_scenarios([{"scenario": "campus,street"}, {"scenario": "jam"}])
         ' on campus, street and jam'
     """
-    named = [str(row["scenario"]).split(",") for row in rows if "scenario" in row]
-    names = list(dict.fromkeys(name for its in named for name in its))
-    return f" on {listed(names, most)}" if names else ""
+    names = [*dict.fromkeys(",".join(str(row["scenario"]) for row in rows if "scenario" in row).split(","))]
+    return f" on {listed(names, most)}" if any(names) else ""
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:

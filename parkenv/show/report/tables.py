@@ -90,7 +90,6 @@ def spread(rows: Sequence[Row], names: Sequence[str], over: str, value: str) -> 
 
 
 def part_of(table: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
-    """Return a table with some of its columns alone."""
     chosen = [i for i, column in enumerate(table["columns"]) if column["key"] in keys]
     return {
         **table,
@@ -101,7 +100,6 @@ def part_of(table: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
 
 
 def described(column: Column) -> dict[str, Any]:
-    """Return a column for the page's data, without empty entries."""
     left_out = ("setting", "needs")
     return {k: v for k, v in column._asdict().items() if v != "" and v is not False and k not in left_out}
 
@@ -129,12 +127,10 @@ def written(column: Mapping[str, Any], value: Cell) -> str:
 
 
 def _first(cell: Cell) -> Cell:
-    """Return a value without its interval."""
     return cell[0] if isinstance(cell, list) else cell
 
 
 def _flat(row: Row, prefix: str = "") -> dict[str, Cell]:
-    """Flatten nested keys and merge intervals; skip lists of rows, which have their own tables."""
     flat: dict[str, Cell] = {}
     for key, value in row.items():
         name = prefix + key

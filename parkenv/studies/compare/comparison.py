@@ -111,8 +111,7 @@ class Grid(Spec):
     )
     budget_ms: Annotated[tuple[Milliseconds, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = option(
         (),
-        "Run agents with the option budget_ms at each of these times per decision, ms; draws "
-        "total time against the time of a decision. Use an idle machine.",
+        "Run agents with the option budget_ms at each of these times per decision, ms. Use an idle machine.",
         takes="MS[,...]",
         default="none",
         strict=False,

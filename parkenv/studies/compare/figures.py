@@ -146,24 +146,12 @@ def _searches(results: ComparisonResults) -> Drawn:
         yield *where, draw_searches(records)
 
 
-def _times_against_decision_time(results: ComparisonResults) -> Drawn:
-    """Yield a figure of each setting in which agents plan for different times."""
-    settings: dict[Setting, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
-    for row in results.rows:
-        if row["scenario"] in results.scenarios and "decision_ms" in row:
-            settings[_setting(row)][row["scenario"]].append(row)
-    for setting, panels in settings.items():
-        if len({row.get("budget_ms") for rows in panels.values() for row in rows} - {None}) > 1:
-            yield "", setting, times.draw_time_against_decision_time(panels)
-
-
 FIGURES: Mapping[str, tuple[str, Callable[[ComparisonResults], Drawn]]] = {
     "time_split": ("Where the time goes", _time_splits),
     "time_distribution": ("How many searches took at most how long", _time_distributions),
     "time_against_occupancy": ("The fuller the lot, the longer it takes", _times_against_occupancy),
     "time_against_failure_cost": ("What failed attempts cost", _times_against_failure_cost),
     "time_against_map": ("If the forecast is the same for every slot", _times_against_map),
-    "time_against_decision_time": ("What time to think is worth", _times_against_decision_time),
     "searches": ("Searches on the same day", _searches),
 }
 """Caption of all figures of each kind and what draws them, by the prefix of their files, in the order of reports."""
