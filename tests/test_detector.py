@@ -322,9 +322,10 @@ def test_a_damaged_image_is_refused_first_and_a_picture_never_replaces_an_image_
     refused = parkenv("detect", tmp_path / "photos", "--out", tmp_path / "out")
     assert (refused.returncode, refused.stdout, (tmp_path / "out").exists()) == (2, "", False)
     assert f"{tmp_path / 'photos' / 'b.png'}: is not a complete image" in refused.stderr
-    a, before = grey_image(tmp_path / "a.png"), grey_image(tmp_path / "a_cars.png").read_bytes()
-    refused = parkenv("detect", tmp_path, "--out", tmp_path)
+    own = tmp_path / "own"
+    a, before = grey_image(own / "a.png"), grey_image(own / "a_cars.png").read_bytes()
+    refused = parkenv("detect", own, "--out", own)
     assert (refused.returncode, refused.stdout) == (2, "")
     assert "a_cars.png would replace an image that is searched" in refused.stderr
-    assert (tmp_path / "a_cars.png").read_bytes() == before
-    assert parkenv("detect", a, "--model", "side", "--out", tmp_path).returncode == 0
+    assert (own / "a_cars.png").read_bytes() == before
+    assert parkenv("detect", a, "--model", "side", "--out", own).returncode == 0
