@@ -13,7 +13,9 @@ import pytest
 from parkenv.errors import InputError
 from parkenv.studies.workers import SERIAL, Workers, kill_workers
 
-each_backend = pytest.mark.parametrize("backend", ["loky", pytest.param("dask", marks=pytest.mark.slow)])
+each_backend = pytest.mark.parametrize(
+    "backend", ["loky", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ray", "dask"))]
+)
 
 
 @pytest.fixture(autouse=True)
@@ -23,8 +25,8 @@ def _importable_by_workers(monkeypatch):
 
 
 def of(backend: str) -> Workers:
-    if backend == "dask":
-        pytest.importorskip("distributed", reason="the extra dask is not installed")
+    for module in {"ray": ["ray"], "dask": ["dask", "distributed"]}.get(backend, []):
+        pytest.importorskip(module, reason=f"the extra {backend} is not installed")
     return Workers(2, backend)
 
 
@@ -123,8 +125,8 @@ def test_an_interruption_is_one_whatever_it_is_wrapped_in():
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        ((1, "slurm"), "backend is 'slurm', want one of loky, dask"),
-        ((1, "loky", "localhost:1"), "address requires the backend dask"),
+        ((1, "slurm"), "backend is 'slurm', want one of loky, ray, dask"),
+        ((1, "loky", "localhost:1"), "address requires the backend ray or dask"),
         ((0,), "jobs is 0, want at least 1"),
     ],
 )
@@ -133,10 +135,17 @@ def test_what_does_not_go_together_is_refused(arguments, wanted):
         Workers(*arguments)
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tcp://somewhere", "127.0.0.1:notaport"])
-def test_an_address_where_nobody_listens_is_refused_at_once(address):
-    of("dask")
+@pytest.mark.parametrize(
+    ("backend", "address", "wanted"),
+    [
+        ("ray", "127.0.0.1:9", "no cluster answers"),
+        ("dask", "tcp://127.0.0.1:9", "no cluster answers"),
+        ("dask", "tcp://somewhere", "want HOST:PORT"),
+        ("ray", "127.0.0.1:notaport", "want HOST:PORT"),
+    ],
+)
+def test_an_address_where_nobody_listens_is_refused_at_once(backend, address, wanted):
     start = time.monotonic()
-    with pytest.raises(InputError, match="no cluster answers"), Workers(2, "dask", address):
+    with pytest.raises(InputError, match=wanted), Workers(2, backend, address):
         pass
     assert time.monotonic() - start < 15.0

@@ -29,7 +29,7 @@ SCENE_LEVELS = tuple(
 )
 """Levels of drawn scenes with a kind of slot each, the easiest first; see `parkenv.driving.levels`."""
 MAX_CARS = 1_000_000  # maximum number of cars of a world
-BackendName = Literal["loky", "dask"]
+BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
 """Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`."""

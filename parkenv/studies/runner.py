@@ -14,6 +14,7 @@ from collections.abc import Collection, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -59,6 +60,10 @@ class Result:
     def complete(self) -> bool:
         """Whether everything is finished."""
         return bool(self.summary["complete"])
+
+    def frame(self) -> Any:
+        """Return `rows` as a pandas `DataFrame`, which is not installed with parkenv."""
+        return import_module("pandas").DataFrame(self.rows)
 
     def figures(self) -> list[Path]:
         """Draw all figures into the folder; return the PNG files there."""

@@ -84,13 +84,13 @@ class ExecutionSpec(Spec):
     )
     backend: BackendName = option(
         "loky",
-        "Run workers on this machine (loky), or on a Dask cluster (extra dask).",
+        "Run workers on this machine (loky), or on a Ray or Dask cluster (extras ray, dask).",
         panel="Machines",
     )
     address: str | None = option(
         None,
-        "Address of the cluster's scheduler, tcp://HOST:8786.",
-        takes="tcp://HOST:PORT",
+        "Address of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler, tcp://HOST:8786.",
+        takes="HOST:PORT",
         panel="Machines",
         default="a cluster on this machine",
     )

@@ -1,4 +1,4 @@
-"""Run tasks in this process, in other processes of this machine, or on a Dask cluster."""
+"""Run tasks in this process, in other processes of this machine, or on a Ray or Dask cluster."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import logging
 import multiprocessing.resource_tracker
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -17,17 +18,20 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, contextmanager
 from types import TracebackType
 from typing import Any, Self, TypeVar, get_args
+from urllib.parse import urlsplit
 
 from joblib import Parallel, cpu_count, delayed
 from joblib.externals.loky import process_executor, reusable_executor
 from joblib.externals.loky.backend import resource_tracker
 
-from parkenv.errors import InputError, ensure, require_one_of, with_extra
+from parkenv.errors import InputError, require_one_of, with_extra
 from parkenv.files.known_names import BackendName
 
 BACKENDS = get_args(BackendName)
-CONNECT_S = 5.0  # time for a cluster to answer at its address, s
-LOSSES = 3  # maximum number of workers that may die in a row without finishing a task
+CONNECT_S = 5.0
+"""Time for a cluster to answer at its address, s."""
+LOSSES = 3
+"""Maximum number of workers that may die in a row without finishing a task."""
 
 Result = TypeVar("Result")
 Task = Callable[[], Result]
@@ -42,9 +46,9 @@ class Workers:
     Args:
         jobs: number of processes, at most one per core and per task; None uses all cores. A single loky process is
             this one. Ignored for a cluster at an address.
-        backend: `loky` for processes of this machine, through joblib; or `dask`.
-        address: address of a cluster's scheduler, `tcp://HOST:8786`. Without one, dask starts a cluster on this machine
-            and stops it at the end.
+        backend: `loky` for processes of this machine, through joblib; or `ray` or `dask`.
+        address: address of a cluster (dask: `tcp://HOST:8786`; ray: `HOST:6379` or `ray://HOST:10001`). Without one,
+            ray and dask start a cluster on this machine and stop it at the end.
 
     Examples:
         >>> with Workers(jobs=1) as workers:
@@ -54,23 +58,24 @@ class Workers:
 
     def __init__(self, jobs: int | None = 1, backend: str = "loky", address: str | None = None) -> None:
         require_one_of("backend", backend, BACKENDS)
-        ensure(
-            address is None or backend != "loky",
-            "address requires the backend dask; loky works on this machine alone",
-        )
-        ensure(jobs is None or jobs >= 1, f"jobs is {jobs}, want at least 1, or None for all cores")
+        if address is not None and backend == "loky":
+            raise InputError("address requires the backend ray or dask; loky works on this machine alone")
+        if jobs is not None and jobs < 1:
+            raise InputError(f"jobs is {jobs}, want at least 1, or None for all cores")
         self.jobs, self.backend, self.address = min(jobs or cpu_count(), cpu_count()), backend, address
         self._open = ExitStack()
         self._run: Callable[[dict[int, Task[Any]]], Generator[tuple[int, Any]]] = self._run_by_loky
         self._results: Generator[tuple[int, Any]] | None = None
-        self._lost: type[BaseException] = BrokenProcessPool
+        self._lost: type[BaseException] | tuple[type[BaseException], ...] = BrokenProcessPool
 
     def __enter__(self) -> Self:
         with ExitStack() as opened:
             opened.enter_context(_safe_path())
+            if self.address is not None:
+                _require_listener(self.address)
             if self.backend != "loky":
                 with _interrupts_blocked():
-                    self._start_dask(opened)
+                    (self._start_ray if self.backend == "ray" else self._start_dask)(opened)
             self._open = opened.pop_all()
         return self
 
@@ -86,6 +91,7 @@ class Workers:
 
     @property
     def in_process(self) -> bool:
+        """Whether tasks run in this process."""
         return self.backend == "loky" and self.jobs == 1
 
     def results(self, tasks: Sequence[Task[Result]]) -> Iterator[tuple[int, Result]]:
@@ -142,25 +148,74 @@ class Workers:
         with closing(results):
             yield from results
 
-    # joblib's own backend of Dask does not say which task failed: a crash would lose finished tasks.
+    # Of joblib's own backends (1.6), Ray's returns no result before all tasks are done, and Dask's does not say which
+    # task failed: a crash would lose finished tasks. So use the queues of Ray and Dask themselves.
+
+    def _start_ray(self, opened: ExitStack) -> None:
+        # Ray reads these variables on import. The second one hides accelerators from tasks that request none; this will
+        # become Ray's default, and Ray warns if it is not set.
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        ray = _required("ray", "ray")
+        on_sigterm = signal.getsignal(signal.SIGTERM)
+        local = {"num_cpus": self.jobs, "include_dashboard": False}
+        try:
+            ray.init(
+                address=self.address or "local",
+                log_to_driver=False,
+                logging_level="error",
+                **({} if self.address else local | {"job_config": _without_working_folder()}),
+            )
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise InputError(f"--backend ray --address {self.address}: {error}") from error
+        if signal.getsignal(signal.SIGTERM) is not on_sigterm:
+            signal.signal(signal.SIGTERM, on_sigterm)  # Ray would end this process
+        opened.callback(ray.shutdown)
+        self._run = _run_by_ray
+        self._lost = (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError)
 
     def _start_dask(self, opened: ExitStack) -> None:
-        with with_extra("--backend dask", "dask"):
-            distributed = importlib.import_module("distributed")
+        distributed = _required("distributed", "dask")
         address = self.address
         if address is None:
-            options = {"threads_per_worker": 1, "dashboard_address": None}
-            cluster = opened.enter_context(distributed.LocalCluster(n_workers=self.jobs, **options))
-            address = cluster.scheduler_address
+            cluster = distributed.LocalCluster(
+                n_workers=self.jobs, threads_per_worker=1, dashboard_address=None
+            )
+            address = opened.enter_context(cluster).scheduler_address
         try:
             client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"--address {address}: no cluster answers ({error}); want tcp://HOST:PORT of its scheduler"
-            ) from error
+        except OSError as error:
+            raise InputError(f"--backend dask --address {address}: no scheduler answers ({error})") from error
         opened.enter_context(client)
         self._run = functools.partial(_run_by_dask, client)
         self._lost = distributed.scheduler.KilledWorker
+
+
+def _without_working_folder() -> Any:
+    """Return settings for a Ray cluster of this machine, whose workers would look in the working folder first."""
+    settings = importlib.import_module("ray.job_config").JobConfig()
+    settings._client_job = True  # as Ray's own client does, which transfers folders otherwise
+    return settings
+
+
+def _run_by_ray(tasks: dict[int, Task[Result]]) -> Generator[tuple[int, Result]]:
+    ray = importlib.import_module("ray")
+    remote = ray.remote(num_cpus=1, max_retries=LOSSES)(_numbered)
+    ahead = 2 * int(ray.cluster_resources().get("CPU", 1))
+    waiting = list(tasks.items())[::-1]
+    running: list[Any] = []
+    while waiting or running:
+        while waiting and len(running) < ahead:
+            running.append(remote.remote(*waiting.pop()))
+        finished, running = ray.wait(running)
+        try:
+            results = ray.get(finished)
+        except ray.exceptions.RayTaskError as error:
+            # Its text is a traceback.
+            if isinstance(error.cause, InputError):
+                raise error.cause from error
+            raise
+        yield from results
 
 
 def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Generator[tuple[int, Result]]:
@@ -172,7 +227,8 @@ def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Generator[tuple
         future.release()
 
 
-SERIAL = Workers(1)  # runs everything in this process
+SERIAL = Workers(1)
+"""Runs everything in this process."""
 
 
 def worker_start() -> dict[str, Any]:
@@ -214,8 +270,10 @@ def _safe_path() -> Iterator[None]:
     try:
         yield
     finally:
-        os.environ.pop("PYTHONSAFEPATH")
-        os.environ |= {} if before is None else {"PYTHONSAFEPATH": before}
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 @contextmanager
@@ -243,6 +301,30 @@ def _numbered(number: int, task: Task[Result]) -> tuple[int, Result]:
     except SystemError as error:
         # Ctrl-C while numba unpacks compiled code arrives wrapped in a SystemError.
         inner: BaseException | None = error
-        while inner is not None and not isinstance(inner, KeyboardInterrupt):
+        while inner is not None:
+            if isinstance(inner, KeyboardInterrupt):
+                raise inner from None
             inner = inner.__cause__
-        raise inner or error from None
+        raise
+
+
+def _require_listener(address: str) -> None:
+    """Raise an error if no cluster answers at an address: the libraries themselves would retry for over a minute."""
+    parts = urlsplit(address if "://" in address else f"//{address}")
+    try:
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or port is None:
+        raise InputError(f"--address is {address!r}, want HOST:PORT, with tcp:// before it for dask")
+    try:
+        socket.create_connection((host, port), timeout=CONNECT_S).close()
+    except OSError as error:
+        raise InputError(
+            f"--address {address}: no cluster answers ({error}); is the cluster's head up, and the port right?"
+        ) from error
+
+
+def _required(module: str, extra: str) -> Any:
+    with with_extra(f"--backend {extra}", extra):
+        return importlib.import_module(module)
