@@ -68,7 +68,7 @@ def require_number(
         Traceback (most recent call last):
         parkenv.errors.InputError: every is -1.0, want a finite number above 0
     """
-    good = isinstance(value, Real) and type(value) is not bool and not math.isnan(value)
+    good = not isinstance(value, bool) and isinstance(value, Real) and not math.isnan(value)
     if (
         not good
         or (finite and math.isinf(value))
@@ -87,7 +87,7 @@ def require_number(
 
 def require_whole(name: str, value: Any, *, least: int = 0, most: int | None = None) -> None:
     """Check that a value is a whole number of at least `least` and, unless that is None, at most `most`."""
-    good = isinstance(value, Integral) and type(value) is not bool
+    good = not isinstance(value, bool) and isinstance(value, Integral)
     if not good or value < least or (most is not None and value > most):
         wanted = f"of at least {least}" if most is None else f"from {least:,} to {most:,}"
         raise InputError(f"{name} is {value!r:.60}, want a whole number {wanted}")

@@ -28,7 +28,8 @@ def centred_logits(p: ArrayLike, deviation: ArrayLike) -> FloatArray:
     table = np.stack([*(a.ravel() for a in each), np.empty(each[0].size)])
     nodes = np.stack([_NODES, _WEIGHTS, np.empty_like(_NODES)])
     _write_centred_logits(address_of(table, float), table.shape[1], address_of(nodes, float))
-    return table[2].reshape(each[0].shape)
+    logits: FloatArray = table[2].reshape(each[0].shape)
+    return logits
 
 
 @compiled(error_model="numpy", _nrt=False)
