@@ -6,6 +6,7 @@ import pytest
 from gymnasium.spaces import flatdim
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 from parkenv.envs.flat_ids import OPTIONS
 
@@ -14,6 +15,12 @@ SCALE, N = 0.01, 4
 
 def make(observation="full", **options):
     return gym.make("parkenv/Search-v2", scenario=["mini", "street"], observation=observation, **options)
+
+
+@pytest.mark.parametrize("name", ["Search-v2", "Drive-v1"])
+@pytest.mark.filterwarnings("error")
+def test_stable_baselines_accepts_it(name):
+    check_env_of_sb3(gym.make(f"parkenv/{name}").unwrapped)
 
 
 @pytest.mark.parametrize("observation", ["local", "occupancy"])

@@ -7,6 +7,7 @@ import pytest
 
 from parkenv import InputError, make_scenario
 from parkenv.lots import grid_lot
+from parkenv.studies.compare.cases import Case, settings_of
 from parkenv.world.lot import PARK
 from planners import CirclingWarning, ParkingMDP, label_setting, make_agent, policy_iteration
 from planners.thesis.mdp import discount
@@ -55,6 +56,20 @@ def test_parking_along_a_line_is_the_best_stop(solve, gamma):
     np.testing.assert_allclose(solution.values, expected, atol=1e-9)
     best = (discount[hops] * park - drive[hops]).argmax(axis=1)
     assert [a == PARK for a in solution.policy] == [best[i] == i for i in range(n)]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_action_promises_more_than_the_value_of_the_optimum(seed):
+    """Bellman's equation on random directed graphs, with dead ends and slots that are certainly free or taken."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 25))
+    neighbors = np.where(rng.random((n, 4)) < 0.6, rng.integers(0, n, (n, 4)), -1)
+    p_free, move_s = rng.choice([0.0, 1.0, *rng.random(4)], n), rng.uniform(0.5, 20.0, (n, 4))
+    mdp = ParkingMDP(neighbors, move_s, p_free, rng.uniform(0, 200, n), 10.0, wait_s=1.0, gamma=0.999)
+    solution = policy_iteration(mdp)
+    q, tolerance = mdp.action_values(solution.values), 1e-9 * (1.0 + np.abs(solution.values).max())
+    np.testing.assert_allclose(q.max(axis=1), solution.values, atol=tolerance, rtol=0)
+    np.testing.assert_allclose(q[np.arange(n), solution.policy], solution.values, atol=tolerance, rtol=0)
 
 
 def test_a_warm_start_ends_at_the_same_optimum_sooner():
@@ -128,3 +143,18 @@ def test_the_shortest_edge_does_not_make_circling_pay():
     np.testing.assert_allclose(costs[0], costs[1], rtol=1e-6)
     exact = make_agent("mdp", scenario, gamma=1.0).expected_time(p_occupied)
     np.testing.assert_allclose(costs[0], exact, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["campus", "jam"])
+def test_who_walks_as_fast_as_they_drive_parks_by_the_entry(name):
+    """Fig. 4.11b."""
+    fast, slow = (settings_of(make_scenario(name), [10.0], [v], [10.0])[0] for v in (10.0, 4.0))
+    planner, nearest, slow_walk = (
+        {
+            key: np.mean([row[key] for row in Case(scenario, agent).run(range(40))])
+            for key in ("driven_m", "walked_m")
+        }
+        for scenario, agent in ((fast, "mdp"), (fast, "greedy-drive"), (slow, "mdp"))
+    )
+    assert planner["driven_m"] <= 1.1 * nearest["driven_m"]
+    assert planner["walked_m"] > slow_walk["walked_m"] + 10.0
