@@ -17,12 +17,6 @@ class InputError(ValueError):
     """
 
 
-def ensure(condition: object, message: str) -> None:
-    """Raise an InputError with the message unless the condition holds."""
-    if not condition:
-        raise InputError(message)
-
-
 def needs_extra(what: str, extra: str) -> str:
     return f"{what} needs the extra {extra}: pip install 'parkenv[{extra}]'"
 
@@ -47,6 +41,7 @@ def naming(source: object) -> Iterator[None]:
 
 
 def require(good: object, message: str) -> None:
+    """Raise an InputError with the message unless the condition holds."""
     if not good:
         raise InputError(message)
 

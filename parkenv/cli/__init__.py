@@ -19,7 +19,7 @@ import typer
 
 from parkenv.cli.command import Entry, make_app
 from parkenv.cli.stop_signals import stop_signals
-from parkenv.errors import InputError, ensure, needs_extra
+from parkenv.errors import InputError, needs_extra, require
 from parkenv.version import __version__
 from sim_sensors.errors import SensorError
 
@@ -128,7 +128,7 @@ def main() -> None:
 
 def _require_unicode(words: Sequence[str]) -> None:
     for word in words:
-        ensure(
+        require(
             word == word.encode(errors="replace").decode(), f"{word!a:.200} on the command line is not UTF-8"
         )
 

@@ -13,7 +13,7 @@ from parkenv.cli.tables import make_console, print_rows, save_summary, stages
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import option
-from parkenv.files.spec_file import DetectorName, Several, require
+from parkenv.files.spec_file import DetectorName, Several, require_together
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.studies.fields import Seed
@@ -170,8 +170,10 @@ class TrainDetector(Command):
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         sources = sum(source is not None for source in (self.uiuc, self.crops, self.labels))
-        require(sources == 1, "give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER")
-        require(self.labels or not (self.images or self.classes), "--images and --classes go with --labels")
+        require_together(sources == 1, "give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER")
+        require_together(
+            self.labels or not (self.images or self.classes), "--images and --classes go with --labels"
+        )
         return self
 
     def run(self) -> None:
@@ -255,7 +257,9 @@ class EvaluateDetector(Command):
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        require((self.uiuc is None) != (self.crops is None), "give one of --uiuc FOLDER and --crops FOLDER")
+        require_together(
+            (self.uiuc is None) != (self.crops is None), "give one of --uiuc FOLDER and --crops FOLDER"
+        )
         return self
 
     def run(self) -> None:

@@ -13,14 +13,14 @@ from typer import Exit
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, print_rows, save_summary, stages
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import check_writable, write_together
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.file_names import file_name
 from parkenv.files.folder_lock import only_writer
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.files.option import Option, numbers_in, option
-from parkenv.files.spec_file import Several, require
+from parkenv.files.spec_file import Several, require_together
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.world.tariff import NO_ZONE
@@ -235,19 +235,19 @@ class Import(Command):
     def _consistent(self) -> Self:
         points = [point for point in (*self.goal, *self.entry) if point != AUTO]
         on_earth = all(abs(lat) <= 90.0 and abs(lon) <= 180.0 for lat, lon in self.box or ())
-        require(not (self.split and self.town), "--split and --town: want one of them")
-        require(
+        require_together(not (self.split and self.town), "--split and --town: want one of them")
+        require_together(
             not (self.split and (points or self.box or self.picture or self.left_hand)),
             "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --around, --picture, "
             "--left-hand",
         )
-        require(self.town or self.car_parks is None, "--car-parks wants --town")
-        require(self.car_parks or not self.listed_only, "--listed-only wants --car-parks")
-        require(
+        require_together(self.town or self.car_parks is None, "--car-parks wants --town")
+        require_together(self.car_parks or not self.listed_only, "--listed-only wants --car-parks")
+        require_together(
             not (self.town and (self.entry or self.goal)),
             "--town has those of the map, want no --entry, --goal",
         )
-        require(on_earth or not self.town, "--bounds: want SOUTH,WEST,NORTH,EAST with --town")
+        require_together(on_earth or not self.town, "--bounds: want SOUTH,WEST,NORTH,EAST with --town")
         return self
 
     @property
@@ -282,7 +282,7 @@ class Import(Command):
 
         check_lot_output(self.out)
         table, town = self.out.with_suffix(".csv"), None
-        ensure(
+        require(
             self.picture is None or self.picture.suffix.lower() == ".png",
             f"--picture {self.picture}: want a name that ends in .png",
         )

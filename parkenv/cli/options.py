@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, Union, get_
 
 from pydantic.fields import FieldInfo
 
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.option import Inside, Option
 from parkenv.files.spec_file import Spec, models_in
 
@@ -175,7 +175,7 @@ def spec_of(model: type[SpecT], given: Given, base: SpecT | None = None) -> Spec
     for option in field_options(model if base is None else type(base)):
         if option.name in given:
             other = chosen.setdefault(option.path, option)
-            ensure(other.name == option.name, f"{other.name} and {option.name} exclude each other")
+            require(other.name == option.name, f"{other.name} and {option.name} exclude each other")
     return _with_values(model, base, {path: (o, o.value(given[o.name])) for path, o in chosen.items()})
 
 

@@ -12,7 +12,7 @@ from typer import echo
 from parkenv.cli.options import Command, Given, command_class, field_options, spec_of
 from parkenv.cli.report import Trust, make_report, require_trust
 from parkenv.cli.tables import command_line, make_console, print_table, stages
-from parkenv.errors import InputError, ensure, nearest
+from parkenv.errors import InputError, nearest, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Option, option
 from parkenv.studies.results import SPEC_FILE, without_nan
@@ -58,7 +58,7 @@ class StudyCommand(RunCommand):
         study, out = command.study, command.out or command.study.folder(given)
         file = out / SPEC_FILE
         if command.resume:
-            ensure(file.exists(), f"--resume: {out} holds no run to resume: no {SPEC_FILE}")
+            require(file.exists(), f"--resume: {out} holds no run to resume: no {SPEC_FILE}")
             study = type(study).read(file)
         if "--backend" in given and "--address" not in given:
             # The address belongs to the other backend.
@@ -137,7 +137,7 @@ class Run(RunCommand, ExecutionSpec):
     def run(self) -> None:
         file, out = self.experiment, self.out
         if file.is_dir():
-            ensure(out is None, f"{file} is the folder of a run, which goes on there; leave out --out")
+            require(out is None, f"{file} is the folder of a run, which goes on there; leave out --out")
             file, out = file / SPEC_FILE, file
         study = read_study(file)
         require_trust(study, self.experiment, self.trust)

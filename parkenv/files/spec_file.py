@@ -107,7 +107,7 @@ class OrText:
 Several = Annotated[tuple[T, ...], Strict(False)]  # a list in the file, a tuple in Python
 
 
-def require(condition: object, message: str) -> None:
+def require_together(condition: object, message: str) -> None:
     """Refuse a specification whose fields do not fit together, in its validator."""
     if not condition:
         raise PydanticCustomError("whole", "{message}", {"message": message})

@@ -8,12 +8,12 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema
 
-from parkenv.errors import ensure
+from parkenv.errors import require
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import SCENARIO_NAMES, RigName
 from parkenv.files.limited_reading import is_there
 from parkenv.files.option import Inside, Option, seconds_of_minutes, words_in
-from parkenv.files.spec_file import Axis, DetectorName, OrText, Several, require
+from parkenv.files.spec_file import Axis, DetectorName, OrText, Several, require_together
 from parkenv.scenarios.spec import (
     ScenarioSpec,
     TrafficSpec,
@@ -72,7 +72,7 @@ def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...
 
 
 def _only(items: Sequence[T], what: str) -> T:
-    ensure(len(items) == 1, f"names {len(items)} {what}, want one")
+    require(len(items) == 1, f"names {len(items)} {what}, want one")
     return items[0]
 
 
@@ -231,12 +231,12 @@ def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[Scena
         ("scenarios", [scenario.title for scenario in scenarios]),
     ):
         repeated = [name for i, name in enumerate(names) if name in names[:i]]
-        require(not repeated, f"{what} has {next(iter(repeated), '')!r} twice")
+        require_together(not repeated, f"{what} has {next(iter(repeated), '')!r} twice")
 
 
 def require_at_most(count: int, what: str, unit: str, most: int = MAX_EPISODES) -> None:
-    require(count <= most, f"{what} is {count} {unit}, want at most {most}")
+    require_together(count <= most, f"{what} is {count} {unit}, want at most {most}")
 
 
 def require_rig(rig: str | None, detector: str | None) -> None:
-    require(detector is None or rig is not None, "detector requires a rig, such as laser")
+    require_together(detector is None or rig is not None, "detector requires a rig, such as laser")

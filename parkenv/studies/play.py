@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from parkenv.compiled.keyed_random import world_key
-from parkenv.errors import ensure
+from parkenv.errors import require
 from parkenv.show.report.page import terms_data
 from parkenv.show.scene import LotScene
 from parkenv.studies.agent_spec import AgentSpec
@@ -40,7 +40,7 @@ def game_data(
     What decides the cost of a search is written as float64, so that the page's search equals `parkenv/Search-v2`.
     """
     lot, actions_s = scenario.lot, scenario.edges["seconds"]
-    ensure(lot.n_slots <= MOST_SLOTS, f"{scenario.name} has {lot.n_slots} slots, want at most {MOST_SLOTS}")
+    require(lot.n_slots <= MOST_SLOTS, f"{scenario.name} has {lot.n_slots} slots, want at most {MOST_SLOTS}")
     cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
     require_distinct(cases)
     runners, worlds = [case.runner() for case in cases], list[dict[str, Any]]()
@@ -106,12 +106,12 @@ def require_same_worlds(case: Case, seeds: Sequence[int]) -> None:
     runner = case.runner()
     played: dict[int, float] = runner.agent.totals  # type: ignore[attr-defined]
     for seed in seeds:
-        ensure(
+        require(
             seed in played,
             f"{case.agent} has no world of seed {seed}, want --seed {min(played)} and --episodes {len(played)}",
         )
         total_s = float(runner.run(seed).metrics["total_s"])
-        ensure(
+        require(
             abs(total_s - played[seed]) <= AGREES_S,
             f"{case.agent}: total_s is {played[seed]:.6f}, want {total_s:.6f}, which the actions of seed {seed} "
             f"take in {case.scenario.name} here: the game had other worlds or costs",

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from pydantic import Field
 
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec, read_tables
@@ -59,19 +59,19 @@ class RunFolder:
     @classmethod
     def read(cls, path: Path) -> Self:
         file, wanted = path / SUMMARY, "want a folder that a command with --out wrote"
-        ensure(path.is_dir(), f"{path}: no such folder; {wanted}")
+        require(path.is_dir(), f"{path}: no such folder; {wanted}")
         if not file.exists():
             is_begun = (path / SUMMARY_PARTIAL).exists() or (path / SETTINGS).exists()
-            ensure(
+            require(
                 not is_begun,
                 f"{path}: holds a run that was interrupted; finish it (--resume), then report it",
             )
             raise InputError(f"{path}: holds no {SUMMARY}; {wanted}")
         summary = read_json(file, finite=True)
-        ensure(isinstance(summary, dict), f"{file}: want the summary of a command")
+        require(isinstance(summary, dict), f"{file}: want the summary of a command")
         damaged = f"{file}: is not as a command wrote it"
         Summary.parse(summary, damaged)
-        ensure(
+        require(
             summary["version"] == __version__,
             f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may differ; "
             "run the command again, or report it with that version",

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import make_folder, write_text
 from parkenv.files.csv_tables import csv_columns, csv_text, write_csv
 from parkenv.files.limited_reading import parse_json, read_json
@@ -351,4 +351,4 @@ def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
 def require_unchanged(spec: Spec, folder: Path) -> None:
     before = (read_settings(folder) or {}).get("files", {})
     for path, now in fingerprints(spec.files()).items():
-        ensure(before.get(path) in (None, now), f"{path} has changed since the run")
+        require(before.get(path) in (None, now), f"{path} has changed since the run")

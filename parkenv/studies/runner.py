@@ -20,7 +20,7 @@ from tempfile import mkdtemp
 from typing import Any
 from uuid import uuid4
 
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.folder_lock import only_writer
 from parkenv.files.limited_reading import read_json
 from parkenv.files.user_class import failure_of
@@ -189,7 +189,7 @@ def open_run(folder: Path | str) -> Result:
     """
     path = Path(folder)
     for name in (SPEC_FILE, SETTINGS, SUMMARY):
-        ensure((path / name).exists(), f"{path}: holds no finished run: no {name}")
+        require((path / name).exists(), f"{path}: holds no finished run: no {name}")
     study = read_study(path / SPEC_FILE)
     results = Results(path, (study.table, *study.further_tables))
     results.read()

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.errors import InputError, nearest, require, require_keywords, require_whole
+from parkenv.errors import nearest, require, require_keywords, require_whole
 from parkenv.files.field_types import NotNegative, Positive, Validated
 from parkenv.world.demand import Demand, TownDemand
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
@@ -141,8 +141,9 @@ class SearchProblem(Validated):
     @property
     def driver(self) -> Drivers:
         """The driver of the search."""
-        bits = self.class_bits(self.classes)
-        return Drivers(self.stay_s, self.priced_at_s, self.value_of_time, bits, self.kwh)
+        return Drivers(
+            self.stay_s, self.priced_at_s, self.value_of_time, self.class_bits(self.classes), self.kwh
+        )
 
     def class_bits(self, classes: Iterable[str]) -> int:
         """Return the number that stands for classes of users in `Drivers`; `public` is always among them.
@@ -152,10 +153,8 @@ class SearchProblem(Validated):
         """
         known = self.lot.classes
         for name in classes:
-            if name not in known:
-                raise InputError(
-                    f"classes has {name!r:.40}, no class of lot {self.lot.name!r:.40}; {nearest(name, known)}"
-                )
+            lot = f"lot {self.lot.name!r:.40}"
+            require(name in known, f"classes has {name!r:.40}, no class of {lot}; {nearest(name, known)}")
         return sum(1 << i for i, name in enumerate(known) if i == 0 or name in classes)
 
     @cached_property

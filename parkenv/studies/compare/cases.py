@@ -14,7 +14,7 @@ import numpy as np
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.keyed_random import world_key
 from parkenv.engine.search_record import SearchRecord
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.known_names import UNBEATEN
 from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.agent_spec import AgentSpec, label_of
@@ -128,7 +128,7 @@ def at_occupancy(scenario: Scenario, level: float) -> Scenario:
     def adjusted(model: Any) -> Any:
         if model is None:
             return None
-        ensure(
+        require(
             model.adjustable,
             f"scenario {scenario.name!r}: a {type(model).__name__} cannot be made {level:.0%} full",
         )

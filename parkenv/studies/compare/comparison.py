@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.field_types import Probability
 from parkenv.files.known_names import UNBEATEN
 from parkenv.files.option import Option, numbers_in, option
@@ -282,12 +282,12 @@ class Comparison(CaseStudy):
             [scenario.name for scenario in self.built],
             ", ".join(agent.label for agent in self.agents),
         )
-        ensure(
+        require(
             not self.grid.blind or any(map(_works_blind, self.agents)),
             f"blind searches have no observations, and all agents plan on observations: {labels}; add one that does "
             "not, such as mdp",
         )
-        ensure(
+        require(
             not self.grid.budget_ms or self.budgeted_agents != list(self.agents),
             f"{BUDGET} is {', '.join(f'{ms:g}' for ms in self.grid.budget_ms)}, and no agent takes it: {labels}; add "
             "one that does, such as rollout",

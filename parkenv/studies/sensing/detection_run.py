@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import cv2
 
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import atomic_write, make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.file_names import distinct_names, file_name
@@ -143,7 +143,7 @@ def detect_in_video(
             if append is not None:
                 append(draw_detections(frame.image, found))
             on_frame()
-        ensure(frames, f"{video.name}: has no frame that can be read")
+        require(frames, f"{video.name}: has no frame that can be read")
     row = {"file": video.name, "frames": frames, "seconds": round(seconds + 1.0 / video.fps, 3)}
     return row | {"fps": video.fps, "boxes": len(boxes), "most_cars": most}, boxes
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import LocaliserName
@@ -64,7 +64,7 @@ def add_recording(
     drive = RecordedDrive(recording, calibration, taken)
     make_folder(folder)
     with MapStore(folder / MAP_FILE, scenario.lot) as store:
-        ensure(not store.has(drive.key), f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
+        require(not store.has(drive.key), f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
         found = map_drive(drive, scenario.lot, finder, every, counted(progress, "Mapping"), localise)
         store.add(found.session)
         log = store.log()

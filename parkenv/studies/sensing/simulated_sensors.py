@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import IntArray
 from parkenv.compiled.keyed_random import world_key
-from parkenv.errors import ensure
+from parkenv.errors import require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import WEATHERS
@@ -48,7 +48,7 @@ def fitted_model(counts: IntArray) -> SensorModel:
     beside the car, by whether it is taken, and by observed state: none, free, taken.
     """
     reported = counts.sum(axis=(0, 1))[:, 1:]
-    ensure(
+    require(
         reported.sum(axis=1).min() >= LEAST_OBSERVATIONS,
         f"{reported.sum(axis=1).tolist()} observations of free and of taken slots, want at least "
         f"{LEAST_OBSERVATIONS} of each",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from parkenv.errors import ensure
+from parkenv.errors import require
 from parkenv.files.csv_tables import NUMBER_OR_NAN, WHOLE, typed_records
 
 CURVE = "curve.csv"
@@ -19,7 +19,7 @@ def read_curve(path: Path, columns: Sequence[str] = ()) -> list[Row]:
     kinds = typed_records(path, lambda column: WHOLE if column == "steps" else NUMBER_OR_NAN)
     curve = [row for _, row in kinds]
     for name in columns:
-        ensure(
+        require(
             all(name in row for row in curve),
             f"{path}: has no column {name!r}, want {', '.join(columns)}",
         )

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_json
 from parkenv.files.option import Inside, Option, option, words_in
-from parkenv.files.spec_file import Several, require
+from parkenv.files.spec_file import Several, require_together
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.columns import Column, shared
 from parkenv.studies.agent_spec import AgentItem, split_agents
@@ -174,8 +174,12 @@ class TrainingSpec(Study):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        require(self.held_out is None or self.evaluate_on is None, "at most one of held_out, evaluate_on")
-        require(self.demonstrations is None or self.clone is not None, "demonstrations requires clone")
+        require_together(
+            self.held_out is None or self.evaluate_on is None, "at most one of held_out, evaluate_on"
+        )
+        require_together(
+            self.demonstrations is None or self.clone is not None, "demonstrations requires clone"
+        )
         return self
 
     @classmethod

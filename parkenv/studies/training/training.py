@@ -25,7 +25,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from parkenv.engine.local_observation import FollowedSearch
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
-from parkenv.errors import InputError, ensure
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import write_csv
 from parkenv.scenarios.build import build
@@ -535,8 +535,8 @@ LEARNING_RATE = 1e-3
 
 
 def require_cloneable(algorithm: str, agent: str, scenario: Scenario) -> None:
-    ensure(algorithm in CLONEABLE, f"{algorithm} has no behaviour cloning; take {' or '.join(CLONEABLE)}")
-    ensure(
+    require(algorithm in CLONEABLE, f"{algorithm} has no behaviour cloning; take {' or '.join(CLONEABLE)}")
+    require(
         not isinstance(make_agent(agent, scenario), ClairvoyantAgent),
         f"{agent} cannot be cloned: it decides on the hidden occupancy, which no policy observes",
     )

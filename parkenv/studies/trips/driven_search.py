@@ -19,7 +19,7 @@ from parkenv.engine import kernel as kernel
 from parkenv.engine.sensor_sampler import Station
 from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
-from parkenv.errors import ensure, require_whole
+from parkenv.errors import require, require_whole
 from parkenv.files.known_names import OBSERVED
 from parkenv.scenarios.calibration import Calibration
 from parkenv.studies.agent_spec import AgentSpec
@@ -276,7 +276,7 @@ def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tu
     seconds = np.array([row["lanes_s"] for row in observed])
     known = samples(rows, speed_limit)
     for name, event in (("manoeuvre_s", "trip has parked"), ("lost_s", "attempt has failed")):
-        ensure(name in known, f"of {len(rows)} trips in {scenario.name!r} no {event}: drive more trips")
+        require(name in known, f"of {len(rows)} trips in {scenario.name!r} no {event}: drive more trips")
     speed = float(metres.sum() / seconds.sum())
     table = [{"what": name, **summary_of(values)} for name, values in known.items()]
     ratio = [speed / KMH, speed / KMH]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo
 
-from parkenv.errors import ensure
+from parkenv.errors import require
 from parkenv.files.known_names import SCENE_LEVELS
 from parkenv.files.option import option, words_in
 from parkenv.files.spec_file import Axis
@@ -137,7 +137,7 @@ class ManoeuvreStudy(Study):
         return level_scene(*source, self.vehicle)
 
     def check(self) -> None:
-        ensure(
+        require(
             (self.cases is None) != (self.levels is None),
             "cases and levels exclude each other: want one of them",
         )

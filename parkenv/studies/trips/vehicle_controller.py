@@ -14,7 +14,7 @@ from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
 from parkenv.driving.parking_task import KINDS, ParkingTasks
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters
 from parkenv.envs.drive_observation import ANGLE_TOLERANCE, POSITION_TOLERANCE
-from parkenv.errors import ensure
+from parkenv.errors import require
 from parkenv.studies.trips.driven_car import (
     ACROSS,
     ALONG,
@@ -77,12 +77,12 @@ class VehicleController:
         self.style = style or DrivingStyle()
         self.car = DrivenCar(scenario, self.vehicle, self.style)
         speed = scenario.v_drive if self.style.speed is None else self.style.speed
-        ensure(
+        require(
             speed <= self.vehicle.max_speed,
             f"the speed on lanes is {speed:g} m/s, want at most {self.vehicle.max_speed:g}, the car's own",
         )
         others = scenario.traffic.cars + scenario.traffic.pedestrians
-        ensure(
+        require(
             others <= MOST_ROAD_USERS,
             f"traffic has {others} cars and pedestrians; a driven trip takes at most {MOST_ROAD_USERS}",
         )
@@ -201,8 +201,8 @@ class VehicleController:
         key = before, edge.line, round(10 * leave), round(10 * edge.start)
         if key not in self._turns:
             there = self.car.all_slots_taken(here.pose(at)[:2])
-            path = self._planned_onto(
-                here.pose(leave), line, edge.start, MERGE_DISTANCES_M, there, TURN_MARGINS
+            path = _path_onto(
+                self.vehicle, here.pose(leave), line, edge.start, MERGE_DISTANCES_M, there, TURN_MARGINS
             )
             if path is not None:
                 ends = line.station_of(path.sampled()[0][-1, :2])
@@ -222,7 +222,7 @@ class VehicleController:
             askew = max(askew, _askew(line.pose(now), self.car.pose))
             there = self.car.refresh()
             onward = MERGE_DISTANCES_M if askew < U_TURN_ANGLE else RETURN_DISTANCES_M
-            path = self._planned_onto(self.car.pose, line, now, onward, there, TURN_MARGINS[-1:])
+            path = _path_onto(self.vehicle, self.car.pose, line, now, onward, there, TURN_MARGINS[-1:])
             if path is None:
                 break
             tracker = PathTracker(self.vehicle, path)
@@ -234,40 +234,6 @@ class VehicleController:
             self._rescue(line)
         self._follow_line(line)
         return TURN if askew < U_TURN_ANGLE else ROUND
-
-    def _planned_onto(
-        self,
-        start: FloatArray,
-        line: DrivenLine,
-        at: float,
-        onward: Sequence[float],
-        there: Obstacles,
-        reserves: Sequence[float],
-    ) -> CarPath | None:
-        """Plan the fastest path from a pose onto a line, with the widest turn possible without reversing."""
-        best: tuple[float, CarPath] | None = None
-        for reserve in reserves:
-            settings = SearchSettings(
-                change_m=_LANE.change_m,
-                reserve=reserve,
-                attempts=_LANE.attempts,
-                most_expansions=4000 if reserve > TURN_MARGINS[-1] else _LANE.most_expansions,
-            )
-            for ahead in onward:
-                station = min(at + ahead, line.length - 0.3)
-                path = plan_path(
-                    self.vehicle, there.corners, there.n_corners, start, line.pose(station), settings
-                )
-                if path is None:
-                    continue
-                cost = _seconds_of(path) - ahead / TYPICAL_SPEED
-                if best is None or cost < best[0]:
-                    best = cost, path
-                if path.length.min() > 0.0:
-                    break
-            if best is not None and best[1].length.min() > 0.0:
-                break
-        return None if best is None else best[1]
 
     def _keep_lane(self) -> bool:
         assert self.car.path is not None
@@ -374,6 +340,39 @@ class VehicleController:
 
     def _rescue(self, line: DrivenLine) -> None:
         self.car.rescue(line.pose(line.station_of(self.car.state[:2])))
+
+
+def _path_onto(
+    vehicle: VehicleParameters,
+    start: FloatArray,
+    line: DrivenLine,
+    at: float,
+    onward: Sequence[float],
+    there: Obstacles,
+    reserves: Sequence[float],
+) -> CarPath | None:
+    """Plan the fastest path from a pose onto a line, with the widest turn possible without reversing."""
+    best: tuple[float, CarPath] | None = None
+    for reserve in reserves:
+        settings = SearchSettings(
+            change_m=_LANE.change_m,
+            reserve=reserve,
+            attempts=_LANE.attempts,
+            most_expansions=4000 if reserve > TURN_MARGINS[-1] else _LANE.most_expansions,
+        )
+        for ahead in onward:
+            station = min(at + ahead, line.length - 0.3)
+            path = plan_path(vehicle, there.corners, there.n_corners, start, line.pose(station), settings)
+            if path is None:
+                continue
+            cost = _seconds_of(path) - ahead / TYPICAL_SPEED
+            if best is None or cost < best[0]:
+                best = cost, path
+            if path.length.min() > 0.0:
+                break
+        if best is not None and best[1].length.min() > 0.0:
+            break
+    return None if best is None else best[1]
 
 
 def _with(there: Obstacles, outline: FloatArray) -> Obstacles:
