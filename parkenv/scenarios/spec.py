@@ -302,7 +302,7 @@ class OccupancySpec(Spec):
             ),
             (
                 self.car_parks and not (self.log and dated),
-                "car_parks only with counts as the log, and replay_from",
+                "car_parks only together with counts as the log, and replay_from",
             ),
             (self.mapping is not None and not self.log, "mapping only together with a log"),
             (dated and not recorded, "replay_from only together with a log or counts"),

@@ -218,7 +218,8 @@ def require_small(problem: SearchProblem) -> None:
     lot = problem.lot
     if lot.n_slots > MOST_SLOTS or lot.n_vertices > 1 << _POSITION_BITS:
         raise InputError(
-            f"lot {lot.name!r} is too large for the exact planner, want at most {MOST_SLOTS} slots"
+            f"lot {lot.name!r} has {lot.n_slots} slots and {lot.n_vertices} vertices; the exact planner takes at most "
+            f"{MOST_SLOTS} slots and {1 << _POSITION_BITS} vertices"
         )
     if not problem.sensor_model.perfect:
         raise InputError("the exact planner requires a sensor model without errors")
