@@ -77,6 +77,13 @@ def cut_in_two():
     )
 
 
+def lasting(lot, taken, said=0.0, **changes):
+    """A scenario with slots that are taken, or free, for good; the forecast has the logit `said` for each."""
+    logits = np.where(taken, 25.0, -25.0), np.full(lot.n_slots, said)
+    occupancy, prior = (OccupancyProcess.from_demand(each, np.zeros(168), 1e9) for each in logits)
+    return Scenario(name="lasting", lot=lot, occupancy=occupancy, prior=prior, **changes)
+
+
 def full_lot(lot):
     """A scenario in which all slots are taken for good, and forecast to be free now and then, some more than others."""
     n = lot.n_slots

@@ -5,7 +5,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_lots import CAR_PARKS, cut_in_two
+from small_lots import CAR_PARKS, cut_in_two, lasting
 
 from parkenv import InputError, OccupancyProcess, Scenario, SearchProblem, SensorModel, make_scenario
 from parkenv.lots import grid_lot
@@ -22,16 +22,6 @@ def episodes(scenario, agent, seeds=SEEDS):
 
 def mean(rows, column):
     return float(np.mean([row[column] for row in rows]))
-
-
-def frozen_world(lot, taken, **changes):
-    """Slots that are always taken or always free, with a forecast of 50 % for each."""
-    occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
-    prior = OccupancyProcess.from_demand(np.zeros(lot.n_slots), np.zeros(168), 1e9)
-    return Scenario(name="frozen", lot=lot, occupancy=occupancy, prior=prior, **changes)
-
-
-# --- the interface ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -146,7 +136,7 @@ def test_random_agent_repeats_itself_under_a_seed():
 @pytest.mark.parametrize("agent", ["mdp", "greedy-goal", "greedy-drive", "first-free", "random"])
 def test_a_full_lot_is_given_up_once_it_is_proven_full(agent):
     lot = grid_lot(2, 5)
-    scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), give_up_s=500.0)
+    scenario = lasting(lot, np.ones(lot.n_slots, dtype=bool), give_up_s=500.0)
     row = EpisodeRunner(scenario, agent, make_agent(agent, scenario)).run(0).row
     assert not row["parked"]
     assert not row["truncated"]
@@ -156,7 +146,7 @@ def test_a_full_lot_is_given_up_once_it_is_proven_full(agent):
 
 def test_a_search_cut_off_is_charged_like_one_that_gave_up():
     lot = grid_lot(2, 5)
-    scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), failure_s=1.0, give_up_s=500.0)
+    scenario = lasting(lot, np.ones(lot.n_slots, dtype=bool), failure_s=1.0, give_up_s=500.0)
     scenario = scenario.replace(sensor_model=SensorModel(view_range=0.0))
     row = EpisodeRunner(scenario, "mdp-static", make_agent("mdp-static", scenario)).run(0).row
     assert row["truncated"]
@@ -166,17 +156,11 @@ def test_a_search_cut_off_is_charged_like_one_that_gave_up():
     assert row["replans"] == 0
 
 
-# --- the planner -----------------------------------------------------------------------------------
-
-
 def test_the_planner_never_tries_a_slot_that_it_sees_taken():
     for name in CAR_PARKS:
         rows = episodes(make_scenario(name), "mdp")
         assert mean(rows, "failed_parks") == 0.0
         assert mean(rows, "replans") > 0.0
-
-
-# --- the oracle ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", CAR_PARKS)

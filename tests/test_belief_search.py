@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from expected_time import expected_time
-from small_lots import cut_in_two, features, full_lot, small_lot
+from small_lots import cut_in_two, features, full_lot, lasting, small_lot
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.lots import grid_lot
@@ -50,22 +50,12 @@ def test_doubting_a_right_map_costs_little():
     assert np.mean([gap(seed) for seed in LOTS]) < 2.0
 
 
-def world(lot, taken, prior_logit=0.0, stay_s=1e9, **changes):
-    """Slots that are taken, or free, for good; the forecast says otherwise."""
-    occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), stay_s)
-    prior = OccupancyProcess.from_demand(np.full(lot.n_slots, prior_logit), np.zeros(168), stay_s)
-    return Scenario(name="fixed", lot=lot, occupancy=occupancy, prior=prior, **changes)
-
-
 def search(scenario, seed=0, **options):
     return EpisodeRunner(scenario, "belief", make_agent("belief", scenario, **options)).run(seed).row
 
 
 def totals_s(scenario, agent, n, options=None):
     return np.array([row["total_s"] for row in Case(scenario, agent, options=options or {}).run(range(n))])
-
-
-# --- the environment ---------------------------------------------------------------------------------
 
 
 def choices(scenario, monkeypatch, seed=1, **options):
@@ -97,7 +87,7 @@ def test_decisions_keep_to_their_budget(monkeypatch):
 
 def test_it_parks_at_once_in_an_empty_lot_that_is_known_to_be():
     lot = grid_lot(2, 20)
-    empty = world(lot, np.zeros(lot.n_slots, dtype=bool), prior_logit=-5.0)
+    empty = lasting(lot, np.zeros(lot.n_slots, dtype=bool), said=-5.0)
     row = search(empty)
     assert row["total_s"] == pytest.approx(row["bound_s"], abs=1.0)
 
@@ -128,13 +118,10 @@ def test_it_looks_at_all_of_a_full_lot_again_and_again():
     assert min(len(set(path[i : i + 150])) for i in (150, 300, 450)) > 80
 
 
-# --- adverse cases ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("rows", "columns"), [(2, 8), (1, 1)])
 def test_nothing_free_anywhere_ends_in_proof(rows, columns):
     lot = grid_lot(rows, columns)
-    row = search(world(lot, np.ones(lot.n_slots, dtype=bool), give_up_s=400.0))
+    row = search(lasting(lot, np.ones(lot.n_slots, dtype=bool), give_up_s=400.0))
     assert (row["gave_up_s"], row["truncated"], row["failed_parks"]) == (400.0, False, 0)
     assert row["drive_s"] < 120.0
 
@@ -142,7 +129,7 @@ def test_nothing_free_anywhere_ends_in_proof(rows, columns):
 @pytest.mark.parametrize("lot", [grid_lot(1, 1), grid_lot(2, 10)])
 def test_the_goal_may_be_the_entry(lot):
     here = ParkingLot(**{**features(lot), "goals": lot.entries})
-    row = search(world(here, np.arange(lot.n_slots) % 3 != 0))
+    row = search(lasting(here, np.arange(lot.n_slots) % 3 != 0))
     assert row["parked"]
     assert row["total_s"] <= 2.0 * row["bound_s"] + 20.0
 
@@ -152,11 +139,11 @@ def test_a_lot_cut_in_two_is_searched_where_a_way_leads():
     half = lot.n_slots // 2
     taken = np.arange(lot.n_slots) < half
     taken[2] = False
-    row = search(world(lot, taken))
+    row = search(lasting(lot, taken))
     assert row["slot"] == "2"
     # Nothing within reach is free, and the other half cannot be proven full: the step limit ends it.
     taken[2] = True
-    row = search(world(lot, taken))
+    row = search(lasting(lot, taken))
     assert row["truncated"]
     assert row["failed_parks"] == 0
 

@@ -118,9 +118,6 @@ def test_cars_may_stand_there_when_the_world_begins():
     assert fleet.counts().sum() == 1
 
 
-# ---- who may not park
-
-
 FORBIDDEN = {"inner": Zone("inner", Price(1.0)), "permit": Zone("permit", users=("permit-a",))}
 
 
@@ -204,9 +201,6 @@ def test_the_walk_back_counts_for_those_who_mind_it():
     assert there["slot"].tolist() == back["slot"].tolist()
     np.testing.assert_allclose(back["walk_s"], 2.0 * there["walk_s"])
     np.testing.assert_allclose(back["walked_m"], 2.0 * there["walked_m"])
-
-
-# ---- what drivers know
 
 
 @pytest.mark.parametrize("capacity", [20, 300])

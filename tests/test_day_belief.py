@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.special import logit
 
 from parkenv.belief import day_belief
 from parkenv.belief.day_belief import EVENT, DayBelief
@@ -19,10 +20,6 @@ def forecast_of(n, seed=0, level=0.8, slope=0.0, decay_rate=0.0, least=0.3):
     near = nearness(rng.uniform(10.0, 90.0, n))
     p = rng.uniform(least, 0.95, n)
     return p, near, SlotBelief.of_forecast(p, np.full(n, decay_rate), (level, slope))
-
-
-def logit(p):
-    return np.log(p / (1.0 - p))
 
 
 @pytest.mark.parametrize(("level", "slope"), [(0.0, 0.0), (0.8, 0.0), (0.5, 0.5), (1.5, 0.0)])

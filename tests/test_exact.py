@@ -10,12 +10,8 @@ from small_lots import small_lot
 
 from parkenv import (
     InputError,
-    Lane,
-    Mouth,
     OccupancyProcess,
-    ParkingLot,
     Scenario,
-    SearchProblem,
     SensorModel,
     make_scenario,
 )
@@ -26,41 +22,6 @@ from planners import make_agent
 from planners.bounds.exact import ExactSolution
 
 BLIND = SensorModel(view_range=0.0)
-
-
-def one_way_line(n, goal_x, pitch=10.0):
-    """Slots along a one-way lane, from west to east; a passed slot cannot be reached again."""
-    xy = np.column_stack([np.arange(1, n + 1) * pitch, np.full(n, -3.0)])
-    lane = Lane(np.array([[0.0, 0.0], [(n + 1) * pitch, 0.0]]), oneway=True)
-    return ParkingLot(
-        "line", tuple(map(str, range(n))), xy, np.zeros(n), np.full(n, 5.0), np.full(n, 2.0),
-        np.full(n, Mouth.LEFT, dtype=np.int8), (lane,), entries=np.zeros((1, 2)), goals=np.array([[goal_x, 0.0]]),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("p_free", [0.05, 0.2, 0.5, 0.9])
-@pytest.mark.parametrize("goal_x", [125.0, 60.0])
-def test_parking_along_a_line_is_the_threshold_policy(p_free, goal_x):
-    """The textbook case: without a way back V_k = p·min(walk_k, d + V_k+1) + (1 - p)·(d + V_k+1)."""
-    n, pitch = 12, 10.0
-    problem = SearchProblem(lot=one_way_line(n, goal_x), sensor_model=BLIND, give_up_s=200.0)
-    entry = int(problem.lot.entry_vertices[0])
-    hop = pitch / problem.v_drive
-    onward, takes = problem.give_up_s, []
-    for k in reversed(range(n)):
-        takes.append(problem.walk_s[k] <= onward)
-        here = p_free * min(problem.walk_s[k], onward) + (1.0 - p_free) * onward
-        onward = hop + here
-    takes.reverse()
-    solution = ExactSolution(problem, np.full(n, 1.0 - p_free), entry)
-    # There is no way on from the last vertex: the search ends there in any case.
-    assert solution.expected_s == pytest.approx(onward)
-    # Far from the goal it drives on past free slots, then takes the first one.
-    assert takes == sorted(takes)
-    for k in range(n):
-        decision = solution.decide(seen=(1 << (k + 1)) - 1, vertex=k, free=1 << k)
-        if decision is not None:
-            assert (decision[1] == -1) == takes[k]
 
 
 def brute_force(problem, p, entry):

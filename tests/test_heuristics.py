@@ -26,9 +26,6 @@ NOISY = SensorModel(
 )
 
 
-# ---- a plain reference
-
-
 def reference_target(name, problem, routes, belief, vertex, previous):
     """The slot to drive to, by its definition."""
     n = problem.lot.n_slots
@@ -111,9 +108,6 @@ def test_agents_decide_as_the_definition_of_their_rule(name):
     assert decisions > 1000
 
 
-# ---- the rule of places
-
-
 def one_way_places(problem):
     """Runs of slots between junctions, for a lot of one-way streets in one zone."""
     neighbors, n = problem.lot.neighbors, problem.lot.n_slots
@@ -190,9 +184,6 @@ def test_nobody_heads_for_a_slot_that_is_not_allowed(name):
         slots = fleet.cars["slot"]
         assert (slots >= 0).all()
         assert (slots % 5 == 0).all()
-
-
-# ---- compiled policies
 
 
 def random_world(seed):

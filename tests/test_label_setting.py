@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 from small_lots import CAR_PARKS
 
-from parkenv import InputError, make_scenario, simulate
+from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.lots import city_lot, grid_lot
 from parkenv.world.lot import PARK
@@ -38,9 +38,6 @@ def expect_same_values(ours, theirs):
     np.testing.assert_allclose(ours, theirs, atol=1e-9 * scale, rtol=0)
 
 
-# --- closed forms ----------------------------------------------------------------------------------
-
-
 def test_without_discount_what_can_reach_no_slot_costs_infinity_and_waits():
     neighbors = [[-1, 1, -1, -1], [-1] * 4, [0, -1, -1, -1]]
     mdp = ParkingMDP(neighbors, np.ones((3, 4)), [0.5, 0.0, 0.0], [5.0] * 3, failure_s=10.0, gamma=1.0)
@@ -59,9 +56,6 @@ def test_ties_go_to_parking_and_then_to_the_first_move():
         [[-1, -1, -1, 1], [-1] * 4], np.full((2, 4), 2.0), [1.0, 1.0], [2.0, 0.0], 0.0, gamma=1.0
     )
     assert list(label_setting(as_good).policy) == [PARK, PARK]
-
-
-# --- every solver against every other ---------------------------------------------------------------
 
 
 @given(
@@ -142,9 +136,6 @@ def test_directed_lots_with_little_free_are_settled_in_one_pass():
             assert solution.iterations == 1 or not p_free.any(), (lot.name, chance)
 
 
-# --- repair ----------------------------------------------------------------------------------------
-
-
 @given(
     seed=seeds,
     gamma=st.sampled_from([0.9, 0.99, 0.9999, 1.0]),
@@ -211,9 +202,6 @@ def test_changes_everywhere_are_planned_afresh(city):
     np.testing.assert_array_equal(labels.cost, set_labels(graph, labels.p_free).cost)
 
 
-# --- the agents ------------------------------------------------------------------------------------
-
-
 # On a full day of mini, failing for ever costs nothing.
 @pytest.mark.filterwarnings("ignore:a failed attempt costs nothing:planners.CirclingWarning")
 @pytest.mark.parametrize("failure_s", [0.0, 10.0, 90.0])
@@ -251,12 +239,6 @@ def test_both_solvers_lead_to_the_same_actions(name, failure_s):
 def test_bad_options_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         make_agent("mdp", make_scenario("mini"), **options)
-
-
-def test_without_discount_the_agent_plans_in_seconds():
-    scenario = make_scenario("campus")
-    env = gym.make("parkenv/Search-v2", scenario=scenario)
-    assert simulate(env, make_agent("mdp", scenario, gamma=1.0), 1).info["parked"]
 
 
 def test_a_hopeless_slot_found_taken_is_news_and_a_drift_is_not():

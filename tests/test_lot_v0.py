@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from gymnasium.error import DependencyNotInstalled, ResetNeeded
+from gymnasium.error import DependencyNotInstalled
 from pettingzoo.test import (
     api_test,
     max_cycles_test,
@@ -156,17 +156,13 @@ def test_bad_options_are_refused_in_a_line(options, words):
         assert "\n" not in str(caught.value)
 
 
-def test_bad_ticks_and_actions_are_refused():
+def test_a_bad_tick_and_missing_actions_are_refused():
     with pytest.raises(InputError, match="tick_s is 0"):
         lot_v0.parallel_env(tick_s=0)
     environment = lot_v0.parallel_env()
     environment.reset(seed=0)
     with pytest.raises(InputError, match="actions lack car_0"):
         environment.step({})
-    with pytest.raises(InputError, match="action is 9"):
-        environment.step({"car_0": 9})
-    with pytest.raises(ResetNeeded):
-        lot_v0.raw_env().step(0)
 
 
 def test_without_pettingzoo_the_extra_is_named(monkeypatch):

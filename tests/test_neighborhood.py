@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import dijkstra
+from small_lots import lasting
 
-from parkenv import OccupancyProcess, Scenario, make_scenario
+from parkenv import make_scenario
 from parkenv.lots import city_lot, grid_lot
 from parkenv.studies.compare.cases import at_occupancy
 from parkenv.studies.episodes import EpisodeRunner
@@ -86,20 +87,11 @@ def test_leaving_out_what_cannot_matter_changes_nothing(level, seeds):
         assert part.run(seed).row["total_s"] == pytest.approx(whole.run(seed).row["total_s"], abs=1e-6)
 
 
-def nearly_full(lot, free):
-    taken = np.ones(lot.n_slots, dtype=bool)
-    taken[free] = False
-    occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
-    prior = OccupancyProcess.from_demand(np.full(lot.n_slots, 1.0), np.zeros(168), 1e9)
-    return Scenario(name="nearly-full", lot=lot, occupancy=occupancy, prior=prior)
-
-
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_where_a_part_is_full_the_search_goes_on_beyond_it(name):
     lot = city_lot(600)
-    order = np.argsort(lot.walk_m())
-    free = order[-40:]
-    scenario = nearly_full(lot, free)
+    free = np.argsort(lot.walk_m())[-40:]
+    scenario = lasting(lot, ~np.isin(np.arange(lot.n_slots), free), said=1.0)
     runner = EpisodeRunner(scenario, name, make_agent(name, scenario, most_vertices=150))
     near = Neighborhoods(scenario.public(), 150).toward(int(lot.entry_vertices[0]))
     row = runner.run(0).row

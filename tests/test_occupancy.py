@@ -77,27 +77,6 @@ def test_a_slow_chain_needs_the_whole_week_for_its_marginal():
     assert process.marginal(50 * HOUR_S)[0] == pytest.approx(1 / 4, abs=1e-5)
 
 
-def test_worlds_are_occupied_as_often_as_the_marginal_says_at_any_time():
-    n = 10_000
-    profile = 1e-4 * (1 + np.sin(np.arange(168)))
-    process = OccupancyProcess(np.ones(n), profile, np.ones(n), np.full(168, 1e-4))
-    world = process.world(KEY, NINE)
-    for time in (9 * HOUR_S, 12.3 * HOUR_S, WEEK_S + 9 * HOUR_S, 2.5 * WEEK_S):
-        p = process.marginal(time)[0]
-        assert world.occupied(np.arange(n), time).mean() == pytest.approx(
-            p, abs=4 * math.sqrt(p * (1 - p) / n)
-        )
-
-
-def test_holding_times_have_the_mean_one_over_the_rate():
-    n = 20_000
-    world = constant_process(n, 1e-3, 1 / 7200).world(KEY, NINE)
-    slots = np.flatnonzero(world.occupied(np.arange(n), NINE.time))
-    stays = world.next_free(slots, NINE.time) - NINE.time
-    assert stays.mean() == pytest.approx(7200, abs=4 * 7200 / math.sqrt(slots.size))
-    assert stays.std() == pytest.approx(7200, rel=0.05)
-
-
 def test_holding_times_skip_the_hours_in_which_nobody_leaves():
     departure = np.zeros(168)
     departure[17] = 1e-2

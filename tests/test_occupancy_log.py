@@ -142,16 +142,6 @@ def replay_of(seconds, states, max_gap_s=7200.0):
     return RecordedOccupancy(log, np.zeros(1)).world(0, at(MONDAYS[0], 0))
 
 
-def test_the_last_known_state_holds_and_in_a_long_gap_the_nearest_one():
-    world = replay_of([7 * HOUR_S, 8 * HOUR_S, 12 * HOUR_S], [1, 0, 1])
-    assert [bool(world.occupied([0], h * HOUR_S)[0]) for h in (0, 6.9, 7, 7.9, 8, 9.9, 10, 12, 23, 40)] == (
-        [True, True, True, True, False, False, True, True, True, True]
-    )
-    assert world.next_free([0], 7.5 * HOUR_S) == 8 * HOUR_S
-    assert world.next_free([0], 9 * HOUR_S) == 9 * HOUR_S
-    assert world.next_free([0], 11 * HOUR_S) == math.inf
-
-
 @settings(max_examples=50)
 @given(
     looks=st.dictionaries(st.integers(0, 86_399), st.booleans(), min_size=1, max_size=8),

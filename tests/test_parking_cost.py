@@ -7,46 +7,30 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from command_line import parkenv as command
-from small_lots import features
+from small_lots import features, lasting
 
-from parkenv import OccupancyProcess, ParkingLot, Scenario
+from parkenv import OccupancyProcess, ParkingLot, simulate
 from parkenv.lots import packaged_lot, write_lot
+from parkenv.studies.episodes import EpisodeRunner
 from parkenv.world.cost_terms import COST_FIELDS
-from planners import ParkingMDP, label_setting, make_agent, policy_iteration
-from planners.agent import ClairvoyantAgent
+from planners import make_agent
 from planners.bounds.oracle import best_slot
 from planners.routes import DriveRoutes
 
 DEAR_S = 600.0
 
 
+def empty_lot(lot):
+    return lasting(lot, np.zeros(lot.n_slots, bool), said=-0.5)
+
+
+def parked_at(name, scenario):
+    row = EpisodeRunner(scenario, name, make_agent(name, scenario)).run(0).row
+    return scenario.lot.slot_ids.index(row["slot"])
+
+
 def priced(lot, cost_s):
     return ParkingLot(**{**features(lot), "slot_parking_cost_s": cost_s})
-
-
-def empty_lot(lot):
-    """All slots are free, with a forecast of about 50 %."""
-    occupancy = OccupancyProcess.from_demand(np.full(lot.n_slots, -25.0), np.zeros(168), 1e9)
-    prior = OccupancyProcess.from_demand(np.full(lot.n_slots, -0.5), np.zeros(168), 1e9)
-    return Scenario(name="empty", lot=lot, occupancy=occupancy, prior=prior)
-
-
-def search(agent, env, seed=0):
-    """The slot in which a search ends, and its total time."""
-    observation, _ = env.reset(seed=seed)
-    state = env.unwrapped.state
-    if isinstance(agent, ClairvoyantAgent):
-        agent.prepare(state.world, state.time)
-    memory, over = None, False
-    while not over:
-        action, memory = agent.predict(observation, memory)
-        observation, _, over, _, info = env.step(action)
-    assert state.parked
-    return state.vertex, info["total_s"]
-
-
-def parked_at(agent, scenario):
-    return search(agent, gym.make("parkenv/Search-v2", scenario=scenario))[0]
 
 
 @pytest.mark.parametrize(
@@ -56,34 +40,15 @@ def parked_at(agent, scenario):
 def test_agents_park_elsewhere_where_that_pays(name):
     lot = packaged_lot("mini")
     plain = empty_lot(lot)
-    chosen = parked_at(make_agent(name, plain), plain)
+    chosen = parked_at(name, plain)
     # The chosen half of the lot is expensive.
     walk_m = lot.walk_m()
     near = walk_m <= np.median(walk_m) if walk_m[chosen] <= np.median(walk_m) else walk_m > np.median(walk_m)
     dear = empty_lot(priced(lot, np.where(near, DEAR_S, 0.0)))
-    assert not near[parked_at(make_agent(name, dear), dear)]
+    assert not near[parked_at(name, dear)]
     # The same price for all slots changes nothing.
     alike = empty_lot(priced(lot, np.full(lot.n_slots, DEAR_S)))
-    assert parked_at(make_agent(name, alike), alike) == chosen
-
-
-@pytest.mark.parametrize("gamma", [0.999, 1.0])
-def test_solvers_agree_on_priced_slots(gamma):
-    rng = np.random.default_rng(3)
-    lot = packaged_lot("street")
-    problem = empty_lot(priced(lot, rng.uniform(0.0, 120.0, lot.n_slots))).public()
-    p_occupied = rng.uniform(0.0, 1.0, lot.n_slots)
-    mdp = ParkingMDP.from_belief(problem, p_occupied, failure_s=10.0, gamma=gamma)
-    by_labels = label_setting(mdp)
-    if gamma < 1.0:
-        np.testing.assert_allclose(by_labels.values, policy_iteration(mdp).values, atol=1e-6)
-    else:
-        # Without discount the value is a closed form: the best slot to drive to and to attempt until it is free.
-        routes, odds = DriveRoutes(problem), p_occupied / (1.0 - p_occupied)
-        for vertex in range(0, lot.n_vertices, 7):
-            drive_s = routes.seconds_from(vertex)[: lot.n_slots]
-            expected = (drive_s + problem.arrival_cost_s + 10.0 * odds).min()
-            assert mdp.expected_time(by_labels.values)[vertex] == pytest.approx(expected)
+    assert parked_at(name, alike) == chosen
 
 
 def test_the_bound_counts_prices():
@@ -104,7 +69,7 @@ def test_the_bound_counts_prices():
         best = best_slot(scenario, routes, state.world, state.vertex, state.time)
         assert best.total_s == pytest.approx(total_s.min())
         # The oracle waits in whole steps.
-        _, reached_s = search(make_agent("oracle", scenario), env, seed)
+        reached_s = simulate(env, make_agent("oracle", scenario), seed).info["total_s"]
         assert best.total_s - 1e-6 <= reached_s <= best.total_s + 2 * scenario.wait_s
 
 

@@ -11,7 +11,7 @@ from parkenv import compare, make_scenario
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot
-from parkenv.world.occupancy.process import Arrival, OccupancyProcess, SlotLaw, World
+from parkenv.world.occupancy.process import Arrival, SlotLaw, World
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.tariff import Zone
 from planners.bounds.exact import ExactSolution
@@ -68,11 +68,6 @@ def test_coarser_groups_give_a_lower_bound_that_still_holds():
     _, coarse, _ = means(problem, p_taken, entry, most_states=1)
     assert coarse <= fine + 1e-3 <= exact + 2e-3
     assert coarse >= clairvoyant - 1e-3
-
-
-def process(p_taken, rate):
-    profile = np.ones(168)
-    return OccupancyProcess(p_taken * rate, profile, (1.0 - p_taken) * rate, profile)
 
 
 def test_the_law_of_a_world_is_that_of_its_slots_on_its_day():

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
@@ -79,54 +79,9 @@ def test_equal_seeds_give_equal_episodes_here_and_in_another_process():
     assert theirs.strip() == digest(env, 5) == digest(env, 5) != digest(env, 2**40)
 
 
-@given(seed=st.integers(0, 1000))
-@settings(max_examples=8)
-def test_the_world_does_not_depend_on_who_drives(seed):
-    """Two cars that behave differently meet the same slot states at the same times."""
-    scenario = make_scenario("street")
-    worlds = []
-    for policy in (0, 1):
-        env = gym.make("parkenv/Search-v2", scenario=scenario)
-        env.reset(seed=seed)
-        rng = np.random.default_rng(policy)
-        for _ in range(20 * policy):
-            env.step(int(rng.integers(0, PARK)))
-        state = env.unwrapped.state
-        times = state.arrival.time + np.array([0.0, 60.0, 600.0, 3600.0])
-        worlds.append([state.world.occupied(np.arange(scenario.lot.n_slots), t) for t in times])
-    np.testing.assert_array_equal(worlds[0], worlds[1])
-
-
 def two_slots(taken):
     lot = grid_lot(1, 2, aisle=6.0)
     return Scenario(name="two", lot=lot, occupancy=always(lot, np.array(taken)), failure_s=7.0, wait_s=2.0)
-
-
-def test_moves_tries_and_parking_cost_what_they_should():
-    scenario = two_slots([True, False])
-    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
-    observation, _ = env.reset(seed=0)
-    lot = scenario.lot
-    missing = int(np.flatnonzero(observation["action_mask"] == 0)[0])
-    observation, reward, *_ = env.step(missing)
-    assert reward == -2.0, "a move that the graph does not have costs the wait"
-    while observation["vertex"] != 0:
-        column = int(np.flatnonzero(lot.neighbors[observation["vertex"]] >= 0)[0])
-        length = lot.edge_length[observation["vertex"], column]
-        observation, reward, *_ = env.step(column)
-        assert reward == pytest.approx(-length / scenario.v_drive)
-    observation, reward, terminated, _, info = env.step(PARK)
-    assert (reward, terminated, info["failed_parks"]) == (-7.0, False, 1)
-    assert observation["p_occupied"][0] == 1.0
-    while observation["vertex"] != 1:
-        column = int(np.flatnonzero(lot.neighbors[observation["vertex"]] >= 0)[-1])
-        observation, *_ = env.step(column)
-    observation, reward, terminated, _, info = env.step(PARK)
-    assert terminated
-    assert info["parked"]
-    assert reward == pytest.approx(-lot.walk_m()[1] / scenario.v_walk)
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(0)
 
 
 def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
@@ -142,29 +97,8 @@ def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
     assert info["reward_terms"]["gave_up"] == -300.0
     assert not info["parked"]
     assert len(seen_before_the_end & {0, 1}) == 1, "it ends as soon as the second of two slots is seen taken"
-
-
-def test_the_time_limit_truncates_and_does_not_terminate():
-    env = gym.make("parkenv/Search-v2", scenario="mini", max_episode_steps=3)
-    env.reset(seed=0)
-    for step in range(3):
-        _, _, terminated, truncated, info = env.step(2)
-        assert not terminated
-        assert truncated == (step == 2)
-    assert info["reward_terms"]["gave_up"] == 0.0
-    assert "total_s" in info
-
-
-def test_the_mask_tells_what_the_graph_has():
-    env = gym.make("parkenv/Search-v2", scenario="mini").unwrapped
-    observation, _ = env.reset(seed=0)
-    lot = env.scenario.lot
-    for _ in range(30):
-        vertex = observation["vertex"]
-        np.testing.assert_array_equal(observation["action_mask"][:PARK], lot.neighbors[vertex] >= 0)
-        assert observation["action_mask"][PARK] == (vertex < lot.n_slots)
-        np.testing.assert_array_equal(env.action_masks(), observation["action_mask"] == 1)
-        observation, *_ = env.step(int(np.flatnonzero(observation["action_mask"][:PARK])[-1]))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(0)
 
 
 def test_state_deepcopy_and_pickle_bring_an_episode_back():
@@ -188,34 +122,15 @@ def test_state_deepcopy_and_pickle_bring_an_episode_back():
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_the_observed_belief_explains_p_occupied(noisy):
-    """`belief` holds all that `p_occupied` is computed from, and its constants are those of the forecast."""
+def test_the_belief_read_from_an_observation_is_that_of_the_environment(noisy):
     model = SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2) if noisy else SensorModel()
     env = gym.make("parkenv/Search-v2", scenario="campus", sensor_model=model).unwrapped
     observation, _ = env.reset(seed=4)
-    foreseen = env.scenario.forecast(env.state.arrival)
     rng = np.random.default_rng(1)
-    observed = np.zeros(env.scenario.lot.n_slots, dtype=bool)
-    before = observation["belief"].reshape(4, -1)[2:]
-    assert (before[1] == -1.0).all()
     for _ in range(60):
-        forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)
-        np.testing.assert_array_equal(forecast, foreseen.p_occupied.astype(np.float32))
-        np.testing.assert_array_equal(decay_rate, foreseen.decay_rate.astype(np.float32))
-        age = np.where(observed_at >= 0.0, observation["time"][1] - observed_at, 0.0)
-        expected = forecast + (p_observed - forecast) * np.exp(-decay_rate * age)
-        np.testing.assert_allclose(observation["p_occupied"], expected, atol=1e-6)
-        np.testing.assert_array_equal(p_observed[observed_at < 0.0], forecast[observed_at < 0.0])
-        # Only slots that were just observed may have changed.
-        changed = (observation["belief"].reshape(4, -1)[2:] != before).any(axis=0)
-        assert (observed_at[changed] == observation["time"][1]).all()
-        observed |= changed
-        np.testing.assert_array_equal(observed_at >= 0.0, env.state.belief.observed)
-        before = observation["belief"].reshape(4, -1)[2:]
-        moves = np.flatnonzero(observation["action_mask"][:PARK])
-        observation, *_ = env.step(rng.choice(moves))
-    assert observed.sum() > 10
+        observation, *_ = env.step(rng.choice(np.flatnonzero(observation["action_mask"][:PARK])))
     now, exact = SlotBelief.of_observation(observation), env.state.belief
+    assert exact.observed.sum() > 10
     for name in "forecast p_occupied p_observed observed_at age observed_free observed_taken".split():
         np.testing.assert_allclose(getattr(now, name), getattr(exact, name), rtol=1e-6, atol=1e-4)
 
@@ -253,20 +168,6 @@ def test_sight_differs_by_distance_and_side():
     across = lot.slot_yaw[slots[rows]] != lot.slot_yaw[0]
     assert across.any()
     np.testing.assert_array_equal(rates.seen[across], 0.25)
-    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
-    seen, looked_taken = np.zeros(lot.n_slots), np.zeros(lot.n_slots)
-    way_to_0 = next(c for c in range(4) for v in [lot.neighbors[lot.entry_vertices[0], c]] if v >= 0)
-    seeds = 250
-    for seed in range(seeds):
-        env.reset(seed=seed)
-        env.step(way_to_0)
-        seen += env.state.belief.observed
-        looked_taken += env.state.belief.p_occupied > env.state.belief.forecast
-    rows = slice(*starts[env.state.vertex : env.state.vertex + 2])
-    view, rates = slots[rows], scenario.sensor_rates.of(rows)
-    np.testing.assert_allclose(seen[view] / seeds, rates.seen, atol=0.1)
-    expected = np.where(taken[view], rates.hit, rates.false_alarm)
-    np.testing.assert_allclose((looked_taken / np.maximum(seen, 1))[view], expected, atol=0.15)
 
 
 def test_wrong_use_is_refused():

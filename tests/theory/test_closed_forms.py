@@ -4,14 +4,12 @@ import math
 from functools import cache
 
 import balance
-import game
 import line
 import numpy as np
 import pytest
 import queues
 from closed_forms import Statement, all_forms, sections
 from line import CHANCES, EQUAL_COSTS, THESIS_SPEEDS, Line
-from ordered_entry import ORDERED_ENTRY
 from queues import MEEK, Queue, Run, erlang_b, lane
 from scipy import stats
 
@@ -51,9 +49,6 @@ def test_a_statement_agrees_where_theory_is_in_its_interval():
     rng = np.random.default_rng(1)
     missed = sum(not Statement("", 0.0, lambda: rng.normal(size=30)).agrees() for _ in range(4000))
     assert missed <= 3, "0.4 are expected"
-
-
-# ---- the line
 
 
 def best_threshold_and_cost(on):
@@ -97,9 +92,6 @@ def test_inspections_are_without_replacement():
         assert not Statement("", line.SLOTS / free, lambda free=free: line.passed(free)).agrees()
 
 
-# ---- many cars
-
-
 @pytest.mark.parametrize(("slots", "load"), [(1, 0.3), (5, 5.0), (10, 8.0), (100, 200.0)])
 def test_erlang_b_is_the_truncated_poisson_law(slots, load):
     law = stats.poisson(load)
@@ -140,24 +132,8 @@ def test_a_driver_at_the_threshold_takes_the_first_free_slot_of_its_zone():
     assert (cars["n_moves"] == 0).all(), "never a single free slot"
 
 
-def test_a_full_lot_is_left_by_ordered_entry():
-    cars = cars_of(1, ORDERED_ENTRY, 50.0, 3.0)
-    parked = cars["slot"] >= 0
-    assert 0 < parked.sum() < len(cars)
-    assert (cars["gave_up_s"][~parked] > 0.0).all()
-
-
 def test_a_lost_car_is_found():
     cars, _, _ = balance.day("mini")
     cars = cars.copy()
     cars["ended_at"][3] += 300.0
     assert balance.unbalanced_events(balance.made_fleet("mini"), cars) > 0
-
-
-def test_drivers_who_compete_pay_for_places_and_failed_searches():
-    expected = [game.expected_price(n) for n in game.DRIVERS]
-    assert expected == pytest.approx([1.2, 1.2857, 1.35, 1.3636, 1.25], abs=1e-4)
-    assert game.competing_cost(game.PLACES) == game.PLACES * game.STREET
-    assert game.competing_cost(game.PLACES + 1) == game.PLACES * game.STREET + game.FAILED
-    assert game.equilibrium(70) == 70
-    assert game.social_cost(50, 60) == pytest.approx(100.0)
