@@ -154,7 +154,7 @@ class Scene:
         Args:
             poses: (n, 3): x, y in m, yaw in rad.
             seeds: (n,) int, seed of each vehicle's model.
-            bodies: (n,) names from `vehicle_classes.BODIES`; None for a body drawn by the seed.
+            bodies: (n,) names from `vehicles.classes.BODIES`; None for a body drawn by the seed.
             paints: (n,) sRGB triples; None for a paint drawn by the seed.
             surroundings: None for an open plain.
 

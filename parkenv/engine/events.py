@@ -433,7 +433,7 @@ def _arrive(fleet: Any) -> int:
     car = car_at(fleet.cars, number)
     fleet.n_free -= 1
     car.search = int64s(fleet.free_searches)[fleet.n_free]
-    car.target, car.n_moves, car.informed_until = NO_CAR, 0, -np.inf
+    car.target, car.n_moves, car.informed_until = NO_SLOT, 0, -np.inf
     fleet.reservations_stale = True
     search = search_at(car.search, 0)
     search.scenario_index, search.car = car.scenario_index, number
@@ -441,7 +441,7 @@ def _arrive(fleet: Any) -> int:
     search.zone_cost_s = fleet.zone_cost_s
     if fleet.zone_cost_s != 0:
         search.zone_cost_s += 8 * fleet.n_zones * number
-    car.vertex, car.stands, car.holds = car.entry, False, NO_CAR
+    car.vertex, car.stands, car.holds = car.entry, False, NO_SLOT
     search.scenario = fleet.scenarios + car.scenario_index * SCENARIO_BYTES
     enter(search, car_key(fleet.key, number), fleet.day, car.arrival, fleet.midnight, car.entry)
     if car.knows == RESERVE_KNOWLEDGE:
@@ -702,6 +702,6 @@ def hold_slot(fleet: Any, car: Any, number: int) -> None:
 
 @inlined
 def release_slot(fleet: Any, car: Any) -> None:
-    if car.holds != NO_CAR:
+    if car.holds != NO_SLOT:
         shared_slot_at(fleet.slots, car.holds).held_by = NO_CAR
-        car.holds = NO_CAR
+        car.holds = NO_SLOT

@@ -13,7 +13,7 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.keyed_random import SLOT_STREAM, car_uniforms
 from parkenv.engine.policy import CompiledPolicy
-from parkenv.engine.records import BACKGROUNDS, CAR, DUE, NO_CAR
+from parkenv.engine.records import BACKGROUNDS, CAR, DUE, NO_SLOT
 from parkenv.errors import InputError, require_one_of
 from parkenv.files.field_types import NotNegative, Validated, Whole
 from parkenv.files.known_names import KNOWLEDGE
@@ -157,9 +157,9 @@ class FleetCars:
         cars["policy"] = np.array(policies, np.int64)[kind]
         cars["knows"] = np.array([KNOWLEDGE.index(driver.knows) for driver in options.drivers])[kind]
         cars["shares"] = np.array([driver.shares for driver in options.drivers])[kind]
-        cars["purpose"], cars["parked_at"] = plans.purpose, NO_CAR
+        cars["purpose"], cars["parked_at"] = plans.purpose, NO_SLOT
         cars["walks"] = 1.0 if self._scenario.walk_back else np.where(plans.walks_back, 2.0, 1.0)
-        cars["state"], cars["slot"] = DUE, NO_CAR
+        cars["state"], cars["slot"] = DUE, NO_SLOT
         cars["ended_at"] = cars["left_at"] = np.inf
         self.drivers = self._drivers_in(plans, demand.class_names)
         self.zone_cost_s = self._zone_costs_by_rules()

@@ -345,6 +345,7 @@ def clear_slots(search: Any) -> None:
 
 @inlined
 def take_step(search: Any, action: int) -> None:
+    """Act, observe and add the costs; unlike `complete_step`, refresh neither the belief nor the clock."""
     drive_or_park(search, action)
     if not search.parked:
         observe(search)
@@ -358,6 +359,7 @@ def write_clock(search: Any) -> None:
 
 @kernel
 def drive_or_park(search: Any, action: int) -> None:
+    """Drive along an edge or attempt to park: the costs, time and state of a step, without observing slots in view."""
     scenario, vertex = scenario_at(search.scenario, 0), search.vertex
     edge = edge_at(scenario.edges, vertex * N_ACTIONS + action)
     clear_step(search)
@@ -478,6 +480,7 @@ def observe_exact(search: Any) -> None:
 
 @kernel
 def observe_noisy(search: Any) -> None:
+    """Observe the slots in view with the scenario's rates: keyed draws of whether each is in sight and looks taken."""
     scenario, key, time = scenario_at(search.scenario, 0), search.key, search.time
     viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
     seen_rate, hit_rate = float64s(scenario.seen_rate), float64s(scenario.hit_rate)

@@ -155,7 +155,7 @@ def has_own_price(search: Any) -> bool:
 
 @inlined
 def arrival_cost_s(search: Any, slot: int) -> float:
-    """Return what arriving in a slot costs the car, s, as `Fleet.arrival_cost_s`: time inside, walk, own stay."""
+    """Return what arriving in a slot costs the car, s, as `FleetCars.arrival_cost_s`: time inside, walk, own stay."""
     scenario = scenario_at(search.scenario, 0)
     cost_s = float64s(scenario.walk_s)[slot] * search.walks + parking_cost_s(search, slot)
     if scenario.enter_s != 0:

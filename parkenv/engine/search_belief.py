@@ -236,6 +236,7 @@ def forecast_of(search: Any, slot: int) -> tuple[float, float]:
 
 @kernel
 def init_full_prior(search: Any) -> None:
+    """Write the forecast of every slot as the belief, (4, width), as if nothing had been observed."""
     scenario, width = scenario_at(search.scenario, 0), search.width
     belief, p_occupied, n = float32s(search.belief), float32s(search.p_occupied), scenario.n_slots
     if scenario.prior_kind == PROCESS_KIND:

@@ -145,6 +145,7 @@ def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:
 
 
 def build(spec: ScenarioSpec) -> Scenario:
+    """Make the world of a specification: its lot, occupancy, forecast, sensor model, costs and demand."""
     try:
         lot, goal = _lot(spec.lot), spec.goal
         if isinstance(goal, tuple):

@@ -31,7 +31,7 @@ class AgentSpec(Spec):
 
     @classmethod
     def of(cls, text: str) -> AgentSpec:
-        return cls.parse(parse_call(text), "--agent")
+        return cls.parse(parse_call(text), "agent")
 
     @property
     def options(self) -> dict[str, Any]:

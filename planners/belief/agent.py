@@ -63,6 +63,8 @@ class Crowd(NamedTuple):
 
 @dataclass
 class BeliefSearch:
+    """What `belief` keeps during one search: its part of the lot, and the path that it follows."""
+
     # the part of the lot that is planned for. The arrays below cover its slots, in its numbering.
     near: Neighborhood
     crowd: Crowd
@@ -273,15 +275,15 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         near, last = memory.near, memory.course
         graph, belief = self._planning_graph(memory), snapshot(here, known, memory)
         choice = best_path(here, last, memory.remaining_s, self._budget, graph, belief, memory.paths)
-        memory.course, (onward_s, remaining_s, following) = choice.course, choice.path
+        memory.course, (expected_s, remaining_s, following) = choice.course, choice.value
         is_same = memory.course.failure_s == last.failure_s and np.array_equal(
             memory.course.targets, last.targets
         )
         memory.replans += not (is_same or math.isnan(last.failure_s))
         # A path that has had its time is given up for a new plan.
         memory.remaining_s = remaining_s if remaining_s > 0.0 else math.inf
-        memory.expected_s = min(onward_s, choice.at_hand_s)
-        if choice.slot >= 0 and choice.at_hand_s <= onward_s + self._worth_passing_s:
+        memory.expected_s = min(expected_s, choice.at_hand_s)
+        if choice.slot >= 0 and choice.at_hand_s <= expected_s + self._worth_passing_s:
             memory.remaining_s = math.inf
             return PARK if choice.slot == here else near.table.move(here, choice.slot)
         if following == ATTEMPT:

@@ -36,9 +36,9 @@ _IMPROVEMENT_S = 1e-6  # s by which a path must improve to get one more target
 
 
 class Value(NamedTuple):
-    """Value of a path."""
+    """Value of a path: expected time to its end, and what is left of it after the first step."""
 
-    onward_s: float  # s, expected time
+    expected_s: float
     # s, expected time left after its first step if the car goes on and that step leads to a vertex where no slot is
     # observed for the first time; else inf
     remaining_s: float
@@ -48,7 +48,7 @@ class Value(NamedTuple):
 class PathChoice(NamedTuple):
     """Result of a search for a path."""
 
-    path: Value
+    value: Value
     at_hand_s: float  # s, expected time of driving to the best slot that is known now
     slot: int  # that slot, or -1
     work: int  # evaluation steps spent on inserting targets; exceeds the budget by one candidate at most
@@ -103,14 +103,14 @@ def _best_path(course: Course, remaining_s: float, search: Search, paths: PathBu
     rollout_path(course, search, path)
     best = _evaluate(remaining_s, search, path)
     # The known free slots make the others better, too, so from there on these cannot become the best.
-    while search_s[c] < best.onward_s:
+    while search_s[c] < best.expected_s:
         plan = _path_at(c, paths)
         plan_value = _evaluate(np.inf, search, plan)
-        if plan_value.onward_s < best.onward_s - _ROUNDING_S:
+        if plan_value.expected_s < best.expected_s - _ROUNDING_S:
             best, chosen, course = plan_value, plan, Course(targets[:0], -1, costs[c])
         search_s[c] = np.inf
         c = np.argmin(search_s)
-    if best.onward_s == np.inf:
+    if best.expected_s == np.inf:
         return PathChoice(best, at_hand_s, slot, 0, Course(targets[:0], -1, course.failure_s))
 
     work, heading = 0, chosen.stops[1].target
@@ -170,7 +170,7 @@ def _plan(c: int, search_s: FloatArray, search: Search, paths: PathBuffer) -> fl
             and _are_equal(path.stops[: state.n_stops + 1], paths.stops[other, : state.n_stops + 1])
         ):
             return float(search_s[other])
-    search_s[c] = _evaluate(np.inf, search, path).onward_s
+    search_s[c] = _evaluate(np.inf, search, path).expected_s
     return float(search_s[c])
 
 
@@ -204,7 +204,7 @@ def _insert_target(
             trial[k + (k >= place)] = targets[k]
         for u in search.nearest_first:
             drive_s = graph.drive_s[vertex, u]
-            if work > search.budget.work or not drive_s < min(best.onward_s, at_hand_s):
+            if work > search.budget.work or not drive_s < min(best.expected_s, at_hand_s):
                 break
             if not is_worth_an_attempt(u, drive_s, -1.0, graph, belief) and (
                 u == before or on_route[place, u] or not _shows_news(u, graph, belief)
@@ -215,29 +215,29 @@ def _insert_target(
             n_stops = path.state[0].n_stops
             work += 30 * (n_stops + path.stops[n_stops].first) + len(belief.slots)
             value = _evaluate(np.inf, search, path)
-            if value.onward_s < best.onward_s - _IMPROVEMENT_S:
+            if value.expected_s < best.expected_s - _IMPROVEMENT_S:
                 best, best_targets = value, trial.copy()
     return best, Course(best_targets, -1, course.failure_s), work
 
 
 @leaf
-def _evaluate(remaining_s: float, search: Search, path: PathBuffer) -> Value:
-    """Evaluate a path. If it was expected to take less, `remaining_s`, that is its value."""
+def _evaluate(planned_s: float, search: Search, path: PathBuffer) -> Value:
+    """Evaluate a path. If it was expected to take less, `planned_s`, that is its value."""
     if path.state[0].n_stops < 2:
         return Value(np.inf, np.inf, NOWHERE)
-    value, onward_s = evaluate_path(search, path)
+    expected_s, remaining_s = evaluate_path(search, path)
     stops = path.stops
-    if remaining_s < value:
-        value, onward_s = remaining_s, remaining_s - stops[1].time
+    if planned_s < expected_s:
+        expected_s, remaining_s = planned_s, planned_s - stops[1].time
     if stops[1].time == 0.0 and stops[2].first > 0:
-        return Value(value, np.inf, ATTEMPT)  # only an attempt takes no time
+        return Value(expected_s, np.inf, ATTEMPT)  # only an attempt takes no time
     following = stops[1].vertex
     if following == search.vertex:
-        onward_s = np.inf
+        remaining_s = np.inf
     for j in range(stops[2].first):
         if path.observations[j].is_first:
-            onward_s = np.inf
-    return Value(value, onward_s, following)
+            remaining_s = np.inf
+    return Value(expected_s, remaining_s, following)
 
 
 @compiled(error_model="numpy")

@@ -77,10 +77,11 @@ OBSERVATION = np.dtype(
         ("expected_s", np.float64),  # scratch: expected time of driving to the slot
         # scratch: s, how much longer the search is expected to take once the slot has decayed
         ("loss_s", np.float64),
-        # scratch: of the slots observed at the same stop, up to this one: P(none is free), s, and what the others add
-        # to the expected time, s
-        ("rest", np.float64),
-        ("value", np.float64),
+        (
+            "rest",
+            np.float64,
+        ),  # scratch: P(none is free) of the slots observed at the same stop, up to this one
+        ("value", np.float64),  # scratch: s, the share of the expected time that these slots have
         ("memory", np.int64),  # scratch: index in `PathBuffer.remembered`; -1 if it is not remembered
         ("is_first", np.bool_),  # whether the slot was not observed before, in fact or along the path
         ("parks", np.bool_),  # whether the car parks in the slot if it is free

@@ -13,7 +13,7 @@ ARCH_GAP = 0.042  # m, between tyre and arch
 class Form:
     """Lines of a body. Vehicle frame (x forward, y left, z up, origin on the ground under the centre), m."""
 
-    body: str  # one of `vehicle_classes.BODIES`
+    body: str  # one of `vehicles.classes.BODIES`
     length: float  # overall, without mirrors
     width: float
     height: float

@@ -31,8 +31,8 @@ class VehicleModel:
     """A vehicle model: shape, paint and trim.
 
     Args:
-        body: one of `vehicle_classes.BODIES`.
-        segment: market segment, as in `vehicle_classes.SIZE_CLASSES`; it determines wheels and nose.
+        body: one of `vehicles.classes.BODIES`.
+        segment: market segment, as in `vehicles.classes.SIZE_CLASSES`; it determines wheels and nose.
         size: length, width without mirrors, height, m.
         paint: sRGB, 0 to 255.
         seed: 0 or more, seed of all other details.
@@ -68,7 +68,7 @@ class VehicleModel:
         """Draw a model: size, paint and trim by frequency.
 
         Args:
-            body: one of `vehicle_classes.BODIES`; None draws it by `BODY_SHARE`.
+            body: one of `vehicles.classes.BODIES`; None draws it by `BODY_SHARE`.
             seed: 0 or more.
         """
         if body is not None and body not in BODIES:

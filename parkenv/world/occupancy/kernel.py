@@ -1,9 +1,9 @@
 """The compiled hidden occupancy: whether a slot is taken at a time.
 
-There are two kinds of worlds. In a process, every slot is a two-state Markov chain whose random numbers are a pure
-function of (key, slot, sojourn), so a state can be computed for any slot at any time in any order. A recorded day is
-read from a log. The worlds of `parkenv.world`, the search environment and its batch all call these functions; the
-hidden occupancy is computed nowhere else.
+In a process, every slot is a two-state Markov chain whose random numbers are a pure function of (key, slot, sojourn):
+a state can be computed for any slot at any time in any order. A recorded day is read from a log; a world of the user's
+own is asked by the addresses of its functions. The worlds of `parkenv.world`, the search environment and its batch all
+call these functions; only slots that a fleet shares are looked up before (`engine.search_belief`).
 
 A *sojourn* is a period in which the state of a slot does not change.
 """
