@@ -38,11 +38,9 @@ def scene():
 def row():
     """Five cars in a row 6 m to the right of a lane along x, seen from the side, the third also from behind one."""
     body, pane = box_mesh(4.3, 1.8, 1.0), box_mesh(1.6, 1.6, 0.5, Material.GLASS)
-    placed, ids = [], []
-    for i, x in enumerate((-11.0, -5.5, 0.0, 5.5, 11.0)):
-        placed += [(0, x, -6.0, 0.2, 0.0), (1, x, -6.0, 1.2, 0.0)]
-        ids += [i + 1, i + 1]
-    return toy_scene([body, pane], placed, ids)
+    parts, places = ((0, 0.2), (1, 1.2)), (-11.0, -5.5, 0.0, 5.5, 11.0)
+    placed = [(mesh, x, -6.0, z, 0.0) for x in places for mesh, z in parts]
+    return toy_scene([body, pane], placed, np.repeat(np.arange(1, 6), 2))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -51,8 +49,7 @@ def test_every_weather_is_deterministic_and_well_exposed(scene, preset):
     assert weather == Weather.draw(preset, 3)
     assert weather != Weather.draw(preset, 4)
     frame, again = (CAMERA.render(scene, POSE, weather, 7) for _ in range(2))
-    assert frame.image.shape == (240, 320, 3)
-    assert frame.image.dtype == np.uint8
+    assert (frame.image.shape, frame.image.dtype) == ((240, 320, 3), np.uint8)
     assert np.array_equal(frame.image, again.image)
     assert np.array_equal(frame.depth, again.depth)
     assert 60 < frame.image.mean() < 170
@@ -123,8 +120,8 @@ def test_same_bytes_on_any_number_of_threads(scene):
             frames.append(CAMERA.render(scene, POSE, weather, 3))
     finally:
         numba.set_num_threads(before)
-    assert np.array_equal(frames[0].image, frames[-1].image)
-    assert np.array_equal(frames[0].ids, frames[-1].ids)
+    for name in ("image", "ids", "depth", "glass_depth"):
+        np.testing.assert_array_equal(*(getattr(frame, name) for frame in (frames[0], frames[-1])))
 
 
 def test_depth_is_of_what_is_opaque_and_ids_of_what_is_first(row):
@@ -146,10 +143,8 @@ def test_shadows_lie_away_from_the_sun():
     weather = Weather(sun_azimuth=0.0, sun_elevation=math.radians(45.0))
     maps = light_maps(scene.pool, scene.instances, weather, 0.0, 0.0)
     # Sun from +x at 45°: the box (±2 m, 1.5 m high) throws its shadow to x = -3.5 m.
-    assert sunlit(maps, -3.3, 0.0, 0.0, 0.05) == 0.0
-    assert sunlit(maps, -3.7, 0.0, 0.0, 0.05) == 1.0
-    assert sunlit(maps, 2.3, 0.0, 0.0, 0.05) == 1.0
-    assert sunlit(maps, 0.0, 0.0, 1.6, 0.05) == 1.0
+    for x, z, lit in ((-3.3, 0.0, 0.0), (-3.7, 0.0, 1.0), (2.3, 0.0, 1.0), (0.0, 1.6, 1.0)):
+        assert sunlit(maps, x, 0.0, z, 0.05) == lit
     assert open_sky(maps, 0.0, 0.0) < 0.1
     assert open_sky(maps, 5.0, 0.0) > 0.99
 
@@ -199,16 +194,15 @@ def test_hidden_vehicles_have_small_visible_fractions():
     camera, pose = PinholeCamera(), camera_pose(0.0, 0.0, 1.2, 0.0)
     boxes = vehicle_boxes(camera, scene, pose, camera.render(scene, pose))
     assert boxes.ids.tolist() == [4, 9, 2]
-    assert boxes.visible_fraction[0] == 1.0
-    assert boxes.visible_fraction[1] < 0.1
-    assert boxes.visible_fraction[2] > 0.8
+    whole, hidden, partly = boxes.visible_fraction
+    assert hidden < 0.1 < 0.8 < partly <= whole == 1.0
     assert boxes.view.tolist() == [View.SIDE, View.SIDE, View.END]
 
 
 def test_stereo_measures_bodies_and_misses_windows():
     # T §3.3: through the windows a stereo camera sees what is behind, and the car seems farther than it is.
     scene, stereo = parked_cars(), StereoCamera(PinholeCamera.from_field_of_view())
-    near, far, windows = [], [], []
+    off = [], [], []
     for i in range(3):
         pose = camera_pose(-20.0 + 9.0 * i, 0.3, 1.35, -math.pi / 2, -0.04)
         pair = stereo.render_stereo(scene, pose, Weather.draw("sunny", i), i)
@@ -217,12 +211,12 @@ def test_stereo_measures_bodies_and_misses_windows():
         truth, pane = pair.left.depth, pair.left.glass_depth
         matched = (shifts > 0) & (pair.left.ids > 0)
         body = matched & np.isinf(pane)
-        near.append(np.abs(depth - truth)[body & (truth > 5.0) & (truth < 7.0)])
-        far.append(np.abs(depth - truth)[body & (truth > 7.0) & (truth < 10.0)])
-        windows.append((depth - pane)[matched & (pane > 5.0) & (pane < 7.0)])
-    assert np.median(np.concatenate(near)) < 0.2
-    assert np.median(np.concatenate(far)) < 0.4
-    assert np.median(np.concatenate(windows)) > 0.4
+        off[0].append(np.abs(depth - truth)[body & (truth > 5.0) & (truth < 7.0)])
+        off[1].append(np.abs(depth - truth)[body & (truth > 7.0) & (truth < 10.0)])
+        off[2].append((depth - pane)[matched & (pane > 5.0) & (pane < 7.0)])
+    near, far, windows = (np.median(np.concatenate(part)) for part in off)
+    assert near < 0.2
+    assert far < 0.4 < windows
 
 
 def test_camera_frame_is_right_down_forward_and_a_right_camera_stands_to_the_right():
@@ -237,10 +231,8 @@ def test_camera_frame_is_right_down_forward_and_a_right_camera_stands_to_the_rig
 
 def test_exposure_holds_its_limits():
     sensor = ImageSensor(least_gain=0.5, greatest_gain=2.0)
-    assert sensor.gain(np.full((64, 64, 3), 1e-4, dtype=np.float32)) == 2.0
-    assert sensor.gain(np.full((64, 64, 3), 50.0, dtype=np.float32)) == 0.5
-    flat = np.full((64, 64, 3), 0.19, dtype=np.float32)
-    assert sensor.gain(flat) == pytest.approx(1.0)
+    dark, bright, flat = (np.full((64, 64, 3), light, dtype=np.float32) for light in (1e-4, 50.0, 0.19))
+    assert [sensor.gain(light) for light in (dark, bright, flat)] == [2.0, 0.5, pytest.approx(1.0)]
     quiet = ImageSensor(shot_noise=0.0, read_noise=0.0, vignetting=0.0)
     # 0.19 linear is 0.473 under the sRGB curve.
     assert np.unique(quiet.expose(flat, 0, 1.0)).tolist() == [121]

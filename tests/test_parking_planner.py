@@ -1,20 +1,18 @@
 """The parking planner: clearance against pymunk, collision-free paths, tracking, whole parking manoeuvres."""
 
-import dataclasses
-import json
 import math
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import ran, summary_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from parkenv import InputError, Traffic
-from parkenv.cli import app
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
@@ -31,6 +29,7 @@ from planners.driving.reeds_shepp import reeds_shepp
 CAR = VehicleParameters()
 LOTS = ("campus", "street", "jam", "mini")
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
+NO_ROOM = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
 LOW, HIGH = np.array([-20.0, -20.0]), np.array([20.0, 20.0])
 
 
@@ -47,9 +46,8 @@ def planned(task, settings=None):
 
 def polygon(rng, k):
     angle = np.sort(rng.uniform(0.0, 2 * math.pi, k))
-    return rng.uniform(-6.0, 6.0, 2) + rng.uniform(0.3, 2.5) * np.stack(
-        [np.cos(angle), np.sin(angle)], axis=1
-    )
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return rng.uniform(-6.0, 6.0, 2) + rng.uniform(0.3, 2.5) * around
 
 
 @given(seed=st.integers(0, 10**6), k=st.sampled_from([2, 3, 4, 8, 24]))
@@ -115,9 +113,9 @@ def test_a_slot_that_is_walled_in_has_no_path():
     box = task.vehicle.corners(task.vehicle.at_rear_axle(task.target))
     center = box.mean(axis=0)
     walls = [(ObstacleKind.WALL, center + 1.15 * (box[[i, (i + 1) % 4]] - center)) for i in range(4)]
-    closed = dataclasses.replace(task, obstacles=Obstacles.of(walls))
+    closed = replace(task, obstacles=Obstacles.of(walls))
     assert planned(closed, SearchSettings(attempts=((0.05, 0.5),))) is None
-    onto = dataclasses.replace(task, obstacles=Obstacles.of([(ObstacleKind.WALL, box[[0, 2]])]))
+    onto = replace(task, obstacles=Obstacles.of([(ObstacleKind.WALL, box[[0, 2]])]))
     assert planned(onto) is None
 
 
@@ -149,13 +147,12 @@ def test_the_planner_parks(lot):
     env, agent = ParkingCase(packaged_lot(lot)).environment(), ParkingAgent()
     for seed in range(3):
         row = park_once(env, agent, seed).row
-        assert row["parked"], row
-        assert row["reason"] == ""
-        assert row["plans"] == 1
+        assert (row["parked"], row["reason"], row["plans"]) == (True, "", 1)
         assert row["time_s"] < 45.0
 
 
-def park_hundreds():
+@pytest.mark.slow
+def test_of_a_hundred_random_parkings_ninety_nine_succeed():
     lots = [packaged_lot(name) for name in LOTS]
     cases = [ParkingCase(lots[0], (kind,)) for kind in ("perpendicular", "oblique")]
     cases += [ParkingCase(lot) for lot in lots[1:]]
@@ -163,12 +160,7 @@ def park_hundreds():
         cases.append(ParkingCase(read_lot(DRAGON_LAKE)))
     per_case = -(-400 // len(cases))
     with Workers(1) as workers:
-        return [p.row for some in park_all(cases, range(1000, 1000 + per_case), workers) for p in some]
-
-
-@pytest.mark.slow
-def test_of_a_hundred_random_parkings_ninety_nine_succeed():
-    rows = park_hundreds()
+        rows = [p.row for some in park_all(cases, range(1000, 1000 + per_case), workers) for p in some]
     (overall,) = [row for row in parking_table(rows) if row["kind"] == "all"]
     assert overall["episodes"] >= 400
     assert overall["success"] >= 0.99
@@ -213,14 +205,12 @@ def test_what_is_made_for_a_vehicle_refuses_another_one(change):
 
 def test_where_no_path_is_the_car_stays_and_that_is_said():
     env = ParkingCase(packaged_lot("mini")).environment()
-    no_room = ParkingAgent(search=SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0))
+    no_room = ParkingAgent(search=NO_ROOM)
     parking = next(p for p in (park_once(env, no_room, seed) for seed in range(20)) if not p.row["parked"])
     assert parking.row["reason"].startswith("no path was found for a car, 4.26 m")
-    assert not parking.row["contact"]
-    assert parking.row["driven_m"] == 0.0
-    table = parking_table([parking.row])
-    assert table[-1]["success"] == 0.0
-    assert table[-1]["contacts"] == 0
+    assert (parking.row["contact"], parking.row["driven_m"]) == ("", 0.0)
+    overall = parking_table([parking.row])[-1]
+    assert (overall["success"], overall["contacts"]) == (0.0, 0)
 
 
 @pytest.mark.parametrize(("blocked", "where"), [((0.0, 0.0), "in the slot"), ((9.0, 0.0), "where it stands")])
@@ -232,29 +222,24 @@ def test_a_pose_without_room_is_named(blocked, where):
 
 
 def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
-    from parkenv.studies.trips import parking_runs
-
-    no_room = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
-    monkeypatch.setattr(parking_runs, "ParkingAgent", lambda vehicle: ParkingAgent(vehicle, search=no_room))
+    monkeypatch.setattr(
+        "parkenv.studies.trips.parking_runs.ParkingAgent",
+        lambda vehicle: ParkingAgent(vehicle, search=NO_ROOM),
+    )
     out = tmp_path / "park"
-    options = [*"--lot mini --way back-in --episodes 2 --slack 0 --jobs 1 --out".split(), str(out)]
-    result = CliRunner().invoke(app, ["park", "--seed", "3", *options])
-    assert result.exit_code == 0, result.output
-    assert "failed: mini, seed 3" in result.output
-    assert "no path was found" in result.output
+    done = ran("park --seed 3 --lot mini --way back-in --episodes 2 --slack 0 --jobs 1 --out", out)
+    assert "failed: mini, seed 3" in done.stdout
+    assert "no path was found" in done.stdout
     assert (out / "failures.png").exists()
     assert not (out / "parkings.png").exists()
 
 
 def test_park_writes_its_table_and_pictures(tmp_path):
     out = tmp_path / "park"
-    result = CliRunner().invoke(app, ["park", "--lot", "mini", "--episodes", "3", "--out", str(out)])
-    assert result.exit_code == 0, result.output
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["rows"][-1]["kind"] == "all"
-    assert summary["rows"][-1]["episodes"] == 3
-    assert sum(row["parked"] for row in summary["rows"][:-1]) == summary["rows"][-1]["parked"]
+    ran("park --lot mini --episodes 3 --out", out)
+    *kinds, overall = summary_of(out)["rows"]
+    assert (overall["kind"], overall["episodes"]) == ("all", 3)
+    assert sum(row["parked"] for row in kinds) == overall["parked"]
     assert len((out / "episodes.csv").read_text().splitlines()) == 4
-    assert (out / "parkings.png").exists()
-    assert (out / "parking.gif").exists()
+    assert {path.name for path in out.iterdir()} >= {"parkings.png", "parking.gif"}
     assert not (out / "failures.png").exists()

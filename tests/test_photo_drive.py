@@ -7,9 +7,10 @@ import math
 import cv2
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import ran
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from PIL import Image
 
 from parkenv import InputError, make_scenario
 from parkenv.files.tracks import read_track
@@ -109,18 +110,21 @@ def test_boxes_that_end_above_the_horizon_are_no_cars(detector, pitch):
         assert len(localize_boxes(found, ground, np.zeros(3), RangingErrors(detector))) == cars
 
 
+def before_a_slot(away):
+    """The lot, a slot, its yaw, and where a vehicle stands whose camera looks into it."""
+    lot, slot = make_scenario("campus").lot, 40
+    yaw = lot.slot_yaw[slot]
+    spot = lot.slot_xy[slot] - away * np.array([math.cos(yaw), math.sin(yaw)])
+    return lot, slot, yaw, np.array([*spot, yaw - RIGHT])
+
+
 def test_cars_are_placed_in_their_slots_and_uncertain_ones_in_none():
     """A car in each of five slots before the camera, by the box of its corners."""
-    lot = make_scenario("campus").lot
-    slot = 40
-    yaw = lot.slot_yaw[slot]
-    spot = lot.slot_xy[slot] - 6.5 * np.array([math.cos(yaw), math.sin(yaw)])
-    ground, vehicle = view_of(), np.array([*spot, yaw - RIGHT])
-    placed = {}
+    (lot, slot, yaw, vehicle), ground, placed = before_a_slot(6.5), view_of(), {}
     for error in (0.1, 3.0):
         slots = SlotFilter(lot)
         near = np.flatnonzero(np.hypot(*(lot.slot_xy - lot.slot_xy[slot]).T) < 4.0)
-        away = lot.slot_xy[near] - spot
+        away = lot.slot_xy[near] - vehicle[:2]
         along, across = corners_of_cars(lot.slot_yaw[near] - yaw)
         ahead = (math.cos(yaw) * away[:, 0] + math.sin(yaw) * away[:, 1])[:, None] + along
         aside = (math.sin(yaw) * away[:, 0] - math.cos(yaw) * away[:, 1])[:, None] + across
@@ -141,11 +145,7 @@ def test_cars_are_placed_in_their_slots_and_uncertain_ones_in_none():
 
 
 def test_slots_where_no_car_is_found_are_free_as_far_as_the_picture_shows():
-    lot = make_scenario("campus").lot
-    slot = 40
-    yaw = lot.slot_yaw[slot]
-    spot = lot.slot_xy[slot] - 7.0 * np.array([math.cos(yaw), math.sin(yaw)])
-    ground, vehicle = view_of(), np.array([*spot, yaw - RIGHT])
+    (lot, slot, _, vehicle), ground = before_a_slot(7.0), view_of()
     none, before = np.empty((0, 4)), np.array([[300.0, 400.0, 980.0, 900.0]])
     for boxes, error, seen in ((none, 0.1, True), (before, 0.1, False), (none, 3.0, False)):
         slots = SlotFilter(lot)
@@ -156,20 +156,21 @@ def test_slots_where_no_car_is_found_are_free_as_far_as_the_picture_shows():
     assert slots.states().p_occupied[slot] == pytest.approx(0.1 / 1.1, abs=0.01)
 
 
+def write_rows(path, rows):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+
+
 def test_tables_and_tracks_say_the_same(tmp_path):
     frame, xy = LocalFrame(7.85, 48.0), np.column_stack([np.linspace(0.0, 9.0, 10), np.zeros(10)])
     lonlat = frame.to_lonlat(xy)
     times = [f"2026-05-04T09:00:{k:02d}.250Z" for k in range(10)]
     points = "".join(POINT.format(*p[::-1], t) for p, t in zip(lonlat, times, strict=True))
     (tmp_path / "t.gpx").write_text(GPX.format(points))
-    globe = [
-        ("time", "lat", "lon", "speed"),
-        *((t, y, x, 3) for t, (x, y) in zip(times, lonlat, strict=True)),
-    ]
-    plane = [("time", "x", "y", "heading"), *((t, x, y, 90.0) for t, (x, y) in zip(times, xy, strict=True))]
-    for name, rows in (("p.csv", globe), ("h.csv", plane)):
-        with (tmp_path / name).open("w", newline="") as file:
-            csv.writer(file).writerows(rows)
+    globe = [(t, y, x, 3) for t, (x, y) in zip(times, lonlat, strict=True)]
+    plane = [(t, x, y, 90.0) for t, (x, y) in zip(times, xy, strict=True)]
+    write_rows(tmp_path / "p.csv", [("time", "lat", "lon", "speed"), *globe])
+    write_rows(tmp_path / "h.csv", [("time", "x", "y", "heading"), *plane])
     track, table, metres = (read_track(tmp_path / name) for name in ("t.gpx", "p.csv", "h.csv"))
     for one in (table, metres):
         np.testing.assert_array_equal(track.stamps, one.stamps)
@@ -212,8 +213,6 @@ def test_bad_poses_are_refused_in_a_line(tmp_path, name, text, names):
 
 
 def photographs(folder, count=4, size=(64, 48), times=False):
-    from PIL import Image
-
     folder.mkdir()
     for k in range(count):
         image = Image.fromarray(np.full((size[1], size[0], 3), 20 * k, np.uint8))
@@ -284,15 +283,12 @@ def test_a_drive_is_mapped_from_its_photographs_and_from_a_film_with_a_track(tmp
         rows.append((f"{i:04d}.png", *pose))
         points.append(POINT.format(*lonlat[i, ::-1], (begin + datetime.timedelta(seconds=i / 4)).isoformat()))
     film.release()
-    with (photos / "poses.csv").open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
+    write_rows(photos / "poses.csv", rows)
     (tmp_path / "track.gpx").write_text(GPX.format("".join(points)))
-    words = ("--scenario", "mini", "--fov", 90, "--detector", "net")
     track = ("--poses", tmp_path / "track.gpx", "--origin", "48.0,7.85", "--pose-error", 0.1)
     for path, more in ((photos, ()), (tmp_path / "film.mp4", track)):
         out = tmp_path / f"of {path.name}"
-        done = parkenv("map-drive", path, *words, *more, "--out", out)
-        assert done.returncode == 0, done.stderr
+        ran("map-drive --scenario mini --fov 90 --detector net", path, *more, "--out", out)
         with MapStore(out / "map.sqlite", lot, create=False) as store:
             p = next(iter(store.sessions())).p_occupied
         seen = ~np.isnan(p)

@@ -1,12 +1,11 @@
 """Videos and folders of anybody's photographs: boxes with frame and time, films, and training from labels."""
 
-import csv
 import json
 
 import cv2
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import parkenv, ran, refused, rows_in, summary_of
 
 from parkenv import InputError
 from parkenv.files.videos import Video, film
@@ -52,10 +51,8 @@ def folder(tmp_path):
 
 def test_a_folder_of_pictures_and_videos_becomes_boxes_and_films(folder, tmp_path):
     out = tmp_path / "out"
-    done = parkenv("detect", folder, "--detector", BRIGHT, "--step", 2, "--out", out)
-    assert done.returncode == 0, done.stderr
-    with (out / "boxes.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    done = ran("detect --step 2", folder, "--detector", BRIGHT, "--out", out)
+    rows = rows_in(out / "boxes.csv")
     frames = [r for r in rows if r["frame"]]
     assert [int(r["frame"]) for r in frames] == [0, 2, 4, 6, 8]
     assert [float(r["time_s"]) for r in frames] == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8])
@@ -63,14 +60,13 @@ def test_a_folder_of_pictures_and_videos_becomes_boxes_and_films(folder, tmp_pat
     (picture,) = [r for r in rows if not r["frame"]]
     assert (picture["left"], picture["view"], picture["time_s"]) == ("20.0", "side", "")
     assert picture["visible_fraction"] == ""  # this detector does not know
-    summary = json.loads((out / "summary.json").read_text())
+    summary = summary_of(out)
     assert [row["file"] for row in summary["rows"]] == [str(folder / "photo.png")]
     (video,) = summary["videos"]
     assert (video["frames"], video["boxes"], video["most_cars"]) == (5, 5, 1)
     assert "drive.mp4: 5 frames of 0.9 s, 5 boxes, at most 1 car in a frame" in done.stdout
-    annotated = Video.of(out / "drive_cars.mp4")
-    assert (annotated.width, annotated.height, annotated.frames) == (*SIZE, 5)
-    assert annotated.fps == pytest.approx(5.0)
+    film = Video.of(out / "drive_cars.mp4")
+    assert (film.width, film.height, film.frames, film.fps) == (*SIZE, 5, pytest.approx(5.0))
     assert (out / "photo_cars.png").is_file()
 
 
@@ -78,10 +74,8 @@ def test_a_folder_of_pictures_and_videos_becomes_boxes_and_films(folder, tmp_pat
 def test_a_video_without_frames_is_refused_in_a_line_before_any_work(folder, tmp_path, content, capfd):
     whole = (folder / "drive.mp4").read_bytes()
     (folder / "z.mp4").write_bytes(whole[:200] if content is None else content)
-    done = parkenv("detect", folder, "--detector", BRIGHT, "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert "z.mp4: is not a video with readable frames, want .mp4, .mov" in " ".join(done.stderr.split())
-    assert done.stderr.count("\n") == 1
+    said = refused("detect", folder, "--detector", BRIGHT, "--out", tmp_path / "out")
+    assert "z.mp4: is not a video with readable frames, want .mp4, .mov" in " ".join(said.split())
     assert not (tmp_path / "out").exists()
     assert not capfd.readouterr().err
 
@@ -91,8 +85,7 @@ def car(rng, image, left, top, width, height):
     image[top : top + height, left : left + width] = rng.integers(150, 220)
     image[top + height // 2 :, left : left + width][: height // 2] = rng.integers(60, 110)
     for x in (0.2, 0.8):
-        middle = (int(left + x * width), top + height)
-        cv2.circle(image, middle, max(height // 6, 2), 10, -1)
+        cv2.circle(image, (int(left + x * width), top + height), max(height // 6, 2), 10, -1)
 
 
 def street(rng):
@@ -135,10 +128,8 @@ def write_yolo(folder, n=14, seed=0, beside=False):
             for its, (x, y, w, h) in boxes
         ]
         (folder / places[1] / f"{k}.txt").write_text("".join(lines))
-    if beside:
-        (folder / "classes.txt").write_text("car\ndog\n")
-    else:
-        (folder / "data.yaml").write_text("path: .\ntrain: images/train\nnames: [car, dog]\n")
+    named = "path: .\ntrain: images/train\nnames: [car, dog]\n"
+    (folder / ("classes.txt" if beside else "data.yaml")).write_text("car\ndog\n" if beside else named)
 
 
 def test_coco_and_yolo_say_the_same(tmp_path):
@@ -174,13 +165,10 @@ def test_a_model_is_trained_on_labels_and_finds_its_cars(tmp_path):
     done = parkenv("train-detector --rounds 1 --jitter 1", *words, "--out", tmp_path / "a.npz")
     assert done.returncode == 0, done.stderr
     assert CarModel.load(tmp_path / "a.npz").region_aspect == 2.5
-    photos = read_labels(tmp_path / "labels.json", tmp_path / "pictures")
-    picture, model = tmp_path / "pictures" / "0.png", tmp_path / "a.npz"
-    done = parkenv("detect", picture, "--model", model, "--least-height", 16, "--out", tmp_path / "found")
-    assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "found" / "summary.json").read_text())["rows"]
-    true = photos[0].labelled.boxes[0]
-    best = max(rows, key=lambda row: row["probability"])["box"]
+    picture, out = tmp_path / "pictures" / "0.png", tmp_path / "found"
+    ran("detect --least-height 16", picture, "--model", tmp_path / "a.npz", "--out", out)
+    best = max(summary_of(out)["rows"], key=lambda row: row["probability"])["box"]
+    true = read_labels(tmp_path / "labels.json", tmp_path / "pictures")[0].labelled.boxes[0]
     np.testing.assert_allclose(best, true, atol=12)
 
 
@@ -223,13 +211,10 @@ def test_damaged_yolo_is_refused_in_a_line(tmp_path, name, text, message):
 
 
 def test_labels_of_few_cars_or_without_names_are_refused(tmp_path):
-    def refused(*words):
-        done = parkenv("train-detector", "--labels", tmp_path, *words, "--out", tmp_path / "m.npz")
-        return " ".join(done.stderr.split())
-
+    words = ("train-detector --labels", tmp_path, "--out", tmp_path / "m.npz")
     write_yolo(tmp_path, n=3)
-    assert "the labels have 3 whole cars seen from the side of at least 36 px" in refused()
-    assert "has no class 'bus'; known: car, dog" in refused("--classes", "bus")
+    assert "the labels have 3 whole cars seen from the side of at least 36 px" in refused(*words)
+    assert "has no class 'bus'; known: car, dog" in refused(*words, "--classes", "bus")
     (tmp_path / "data.yaml").unlink()
-    assert "has neither data.yaml with names nor classes.txt" in refused()
-    assert "give one of --uiuc FOLDER, --crops FOLDER and --labels" in refused("--uiuc", tmp_path)
+    assert "has neither data.yaml with names nor classes.txt" in refused(*words)
+    assert "give one of --uiuc FOLDER, --crops FOLDER and --labels" in refused(*words, "--uiuc", tmp_path)

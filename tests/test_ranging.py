@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from laser_drive import CAMERA, EYE, LASER, MOUNT, look, turned_off
 
 from parkenv import InputError
 from parkenv.lots import packaged_lot
 from parkenv.mapping.route import survey_route
 from parkenv.perception.box_fit import fit_box
 from parkenv.perception.detector import Detections
-from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
+from parkenv.perception.range_scan import disparity, scan_from_laser, scan_from_stereo
 from parkenv.perception.ranging import (
     beams_between,
     bearings,
@@ -30,6 +29,42 @@ from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.rig import Mount, SensorRig, poses_along
 
 ORIGIN = np.zeros(3)
+RIG = SensorRig.thesis()
+_, CAMERA, EYE = RIG.cameras[0]
+_, LASER, MOUNT = RIG.lasers[0]
+_, STEREO, STEREO_MOUNT = SensorRig.stereo().stereo_cameras[0]
+LEAST_BEAMS, FARTHEST_M = 8, 12.0
+CAR_HIGH = 1.5
+END_LIMIT = math.radians(60.0)
+
+
+def look(scene, pose, rng):
+    """A sweep, detections as a faultless camera would make them, and the place of each one's car.
+
+    Boxes are around the beams that end on a parked car, within the camera's image.
+    """
+    scan, ids = LASER.scan_with_ids(scene.scan_plane, MOUNT.in_world(pose), rng)
+    off = LASER.angles - EYE.yaw
+    in_image = np.abs(off) < math.atan(CAMERA.cx / CAMERA.fx)
+    boxes, ends, places = [], [], []
+    for car in np.unique(ids[in_image & (ids > 0) & (ids <= scene.n_vehicles)]):
+        on_it = in_image & (ids == car) & np.isfinite(scan)
+        if on_it.sum() < LEAST_BEAMS or np.median(scan[on_it]) > FARTHEST_M:
+            continue
+        column = CAMERA.cx - CAMERA.fx * np.tan(off[on_it])
+        depth = np.median((scan * np.cos(off))[on_it])
+        rows = CAMERA.cy + CAMERA.fy * (EYE.z - np.array([CAR_HIGH, 0.0])) / depth
+        boxes.append([column.min(), rows[0], column.max(), rows[1]])
+        x, y, yaw = scene.vehicle_pose[car - 1]
+        angle = abs(math.atan2(y - pose[1], x - pose[0]) - yaw) % math.pi
+        ends.append(min(angle, math.pi - angle) < END_LIMIT)
+        places.append(int(car) - 1)
+    return scan_from_laser(LASER, MOUNT, pose, scan), boxes_of(*boxes, ends=ends), places
+
+
+def turned_off(yaw, true):
+    """Angle between directions that are alike both ways round, rad."""
+    return np.abs((yaw - true + math.pi / 2) % math.pi - math.pi / 2)
 
 
 def rectangle(x, y, yaw, length, width):
@@ -47,7 +82,7 @@ def swept(*cars, pose=(0.0, 0.0, 0.0), rng=None):
 def boxes_of(*boxes, ends=True):
     table = np.array(boxes, dtype=np.float32).reshape(-1, 4)
     sure = np.ones(len(table), dtype=np.float32)
-    return Detections(table, sure, np.full(len(table), ends))
+    return Detections(table, sure, np.full(len(table), ends, dtype=bool))
 
 
 def test_the_middle_of_the_image_is_the_beam_to_the_right():
@@ -56,8 +91,7 @@ def test_the_middle_of_the_image_is_the_beam_to_the_right():
     box = np.array([[CAMERA.cx - 4.0, 0.0, CAMERA.cx + 4.0, 9.0]], dtype=np.float32)
     left, right = bearings(CAMERA, EYE, ORIGIN, box)[0]
     assert left > -math.pi / 2 > right
-    beams = beams_between(scan, left, right)
-    assert beams.tolist() == list(range(178, 183))
+    assert beams_between(scan, left, right).tolist() == list(range(178, 183))
 
 
 @given(yaw=st.floats(-10, 10), u=st.floats(0, 639), v=st.floats(0, 639))
@@ -93,8 +127,7 @@ def test_a_neighbour_at_the_margin_does_not_count_and_a_run_goes_on_where_the_im
     assert run.cut == (False, True), "the van hides where the car ends"
     # A run goes on where the image ends.
     scan = swept((0.0, -3.6, 0.0, 4.4, 1.8))
-    left, right = -math.pi / 2 + 0.2, -math.pi / 2 - 0.2
-    inside = beams_between(scan, left, right)
+    inside = beams_between(scan, -math.pi / 2 + 0.2, -math.pi / 2 - 0.2)
     short, whole = car_beams(scan, inside), car_beams(scan, inside, (True, True))
     assert set(short.beams) <= set(inside)
     ends = scan.points(whole.beams[[0, -1]])[:, 0]
@@ -107,9 +140,8 @@ def test_what_no_beam_meets_has_no_distance():
     assert len(beams)
     assert math.isnan(median_distance(scan, beams))
     assert not len(car_beams(scan, beams).beams)
-    box = boxes_of([300, 200, 340, 300])
-    assert len(localize_cars(box, scan, CAMERA, EYE, ORIGIN)) == 0
-    assert len(localize_median(box, scan, CAMERA, EYE, ORIGIN)) == 0
+    for way in (localize_cars, localize_median):
+        assert len(way(boxes_of([300, 200, 340, 300]), scan, CAMERA, EYE, ORIGIN)) == 0
 
 
 @pytest.mark.parametrize(
@@ -172,10 +204,8 @@ def test_one_short_side_is_an_end_or_a_flank_as_the_detector_says(end_on, yaw, y
 def test_a_car_goes_on_from_where_the_view_is_cut():
     """A flank from 1 m to 4 m ahead; its near end is real, or its far one."""
     flank = np.column_stack([np.linspace(1.0, 4.0, 60), np.full(60, -3.0)])
-    near = fit_box(flank, np.zeros(2), end_on=False, cut=(False, True))
-    far = fit_box(flank, np.zeros(2), end_on=False, cut=(True, False))
-    assert near.x == pytest.approx(1.0 + 2.2, abs=0.05)
-    assert far.x == pytest.approx(4.0 - 2.2, abs=0.05)
+    for cut, x in (((False, True), 1.0 + 2.2), ((True, False), 4.0 - 2.2)):
+        assert fit_box(flank, np.zeros(2), end_on=False, cut=cut).x == pytest.approx(x, abs=0.05)
 
 
 @pytest.mark.parametrize("name", ["campus", "street"])
@@ -186,7 +216,7 @@ def test_fitted_cars_stand_where_the_cars_do(name):
     scene = slot_lot(lot, 1).scene(rng.random(lot.n_slots) < 0.6)
     off = {localize_cars: [], localize_median: []}
     for pose in poses_along(survey_route(lot).path, 8.0):
-        scan, found, places = look(scene, pose, rng=rng)
+        scan, found, places = look(scene, pose, rng)
         for k in range(len(found)):
             true = scene.vehicle_pose[places[k]]
             for way, errors in off.items():
@@ -206,62 +236,48 @@ def beside(pose, xy):
     return np.count_nonzero((away > 2.0) & (away < 10.0) & (np.abs(along) < 0.8 * away))
 
 
-@pytest.fixture(scope="module")
-def pairs():
-    """Stereo pairs of a row of perpendicular slots and of a kerb, with the objects in their boxes."""
-    rig = SensorRig.stereo()
-    _, stereo, mount = rig.stereo_cameras[0]
-    looks = []
+@pytest.mark.slow
+def test_cars_are_placed_from_stereo_alone():
+    """In a row of perpendicular slots and at a kerb, from boxes around what is near."""
+    errors = []
     for name in ("campus", "street"):
         lot = packaged_lot(name)
         scene = slot_lot(lot, 2).scene(np.random.default_rng(2).random(lot.n_slots) < 0.7)
         way = poses_along(survey_route(lot).path, 3.0)
         cars = [beside(pose, scene.vehicle_pose[:, :2]) for pose in way]
         for pose in way[np.argsort(cars, kind="stable")[-14::5]]:
-            pair = rig.capture(scene, pose).pairs["right"]
-            boxes = vehicle_boxes(stereo.camera, scene, mount.camera_pose(pose), pair.left)
+            pair = SensorRig.stereo().capture(scene, pose).pairs["right"]
+            disparities = disparity(pair, STEREO)
+            boxes = vehicle_boxes(STEREO.camera, scene, STEREO_MOUNT.camera_pose(pose), pair.left)
             near = (boxes.visible_fraction > 0.6) & (boxes.distance < 10.0) & (boxes.ids <= scene.n_vehicles)
-            found = boxes_of(*boxes.visible_box[near].tolist(), ends=False)
-            found.end_on[:] = boxes.view[near] != View.SIDE
-            looks.append((scene, pose, pair, disparity(pair, stereo), found, boxes.ids[near] - 1))
-    return stereo, mount, looks
-
-
-@pytest.mark.slow
-def test_cars_are_placed_from_stereo_alone(pairs):
-    stereo, mount, looks = pairs
-    errors = {"fitted": [], "thesis": []}
-    for scene, pose, _, disparities, found, places in looks:
-        scan = scan_from_stereo(stereo, mount, pose, disparities)
-        for k, place in enumerate(places):
-            one, true = found.select(np.array([k])), scene.vehicle_pose[place]
-            fitted = localize_cars(one, scan, stereo.camera, mount, pose)
-            plain = localize_disparity(one, disparities, stereo, mount, pose)
-            if len(fitted) and len(plain):
-                for name, car in (("fitted", fitted), ("thesis", plain)):
-                    errors[name].append((np.hypot(*(car.xy[0] - true[:2])), turned_off(car.yaw[0], true[2])))
-    fitted, thesis = np.array(errors["fitted"]), np.array(errors["thesis"])
+            found = boxes_of(*boxes.visible_box[near].tolist(), ends=boxes.view[near] != View.SIDE)
+            scan = scan_from_stereo(STEREO, STEREO_MOUNT, pose, disparities)
+            for k, place in enumerate(boxes.ids[near] - 1):
+                one, true = found.select(np.array([k])), scene.vehicle_pose[place]
+                fitted = localize_cars(one, scan, STEREO.camera, STEREO_MOUNT, pose)
+                plain = localize_disparity(one, disparities, STEREO, STEREO_MOUNT, pose)
+                if len(fitted) and len(plain):
+                    ways = [(c.xy[0] - true[:2], turned_off(c.yaw[0], true[2])) for c in (fitted, plain)]
+                    errors.append([(np.hypot(*off), turn) for off, turn in ways])
+    fitted, thesis = np.array(errors).swapaxes(0, 1)
     assert len(fitted) >= 8
     assert np.median(fitted[:, 0]) < min(0.6, np.median(thesis[:, 0]))
     assert np.median(fitted[:, 1]) < math.radians(10) < np.median(thesis[:, 1])
 
 
-def test_a_box_without_a_match_has_no_depth(pairs):
-    stereo, mount, _ = pairs
+def test_a_box_without_a_match_has_no_depth():
     nothing = np.full((480, 640), np.nan, np.float32)
     box = boxes_of([100, 100, 300, 300])
-    assert math.isnan(median_depth(nothing, box.boxes[0], stereo))
-    assert len(localize_disparity(box, nothing, stereo, mount, ORIGIN)) == 0
-    scan = scan_from_stereo(stereo, mount, ORIGIN, nothing)
+    assert math.isnan(median_depth(nothing, box.boxes[0], STEREO))
+    assert len(localize_disparity(box, nothing, STEREO, STEREO_MOUNT, ORIGIN)) == 0
+    scan = scan_from_stereo(STEREO, STEREO_MOUNT, ORIGIN, nothing)
     assert np.isnan(scan.distance).all()
-    assert len(localize_cars(box, scan, stereo.camera, mount, ORIGIN)) == 0
+    assert len(localize_cars(box, scan, STEREO.camera, STEREO_MOUNT, ORIGIN)) == 0
 
 
-def test_a_wall_fills_a_scan_from_stereo(pairs):
+def test_a_wall_fills_a_scan_from_stereo():
     """With every pixel at 6 m, objects at bumper height are hit there in every direction, and angles ascend."""
-    stereo, mount, _ = pairs
-    disparities = np.full((480, 640), stereo.camera.fx * stereo.baseline / 6.0, np.float32)
-    scan = scan_from_stereo(stereo, mount, ORIGIN, disparities)
+    disparities = np.full((480, 640), STEREO.camera.fx * STEREO.baseline / 6.0, np.float32)
+    scan = scan_from_stereo(STEREO, STEREO_MOUNT, ORIGIN, disparities)
     assert (np.diff(scan.angle) > 0.0).all()
     assert scan.points(np.arange(len(scan.angle)))[:, 1] == pytest.approx(-6.0, abs=1e-4)
-    assert isinstance(scan, RangeScan)

@@ -18,12 +18,11 @@ BLOCKS = 20
 DATA = Path(__file__).parents[2] / "shared" / "data"
 UIUC, KITTI = DATA / "uiuc_cars_train", DATA / "kitti_crops" / "vehicles_and_background.zip"
 
-needs_uiuc = pytest.mark.skipif(
-    not UIUC.exists(), reason="UIUC's car images, which their publisher provides, are not here"
+needs_uiuc, needs_kitti = (
+    pytest.mark.skipif(not data.exists(), reason=f"{data.name}, which its publisher provides, is not here")
+    for data in (UIUC, KITTI)
 )
-needs_kitti = pytest.mark.skipif(
-    not KITTI.exists(), reason="KITTI's crops, which their publisher provides, are not here"
-)
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -50,20 +49,17 @@ def recall(model, crops):
 
 
 @needs_uiuc
-@pytest.mark.slow
 def test_the_shipped_side_model_knows_real_cars(uiuc):
     assert recall(CarModel.load("side"), uiuc) > 0.98
 
 
 @needs_uiuc
-@pytest.mark.slow
 def test_training_on_uiuc_generalizes_to_crops_held_out(uiuc):
     known, held_out = halves(uiuc)
     assert recall(train(known.positives, known.negatives), held_out) > 0.985
 
 
 @needs_uiuc
-@pytest.mark.slow
 def test_the_shipped_side_model_scans_real_photographs(uiuc):
     """Every crop as a separate image, and the backgrounds also at twice their size."""
     nothing = np.empty((0, 4))
@@ -74,7 +70,6 @@ def test_the_shipped_side_model_scans_real_photographs(uiuc):
 
 
 @needs_kitti
-@pytest.mark.slow
 def test_training_on_real_crops_generalizes_to_others(tmp_path):
     with zipfile.ZipFile(KITTI) as archive:
         archive.extractall(tmp_path)

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import parkenv, ran
 
 from parkenv import InputError, make_scenario
 from parkenv.files.recordings import footage_in
@@ -20,6 +20,9 @@ from sim_sensors.camera.models import Frame
 from sim_sensors.rig import Capture, SensorRig, TimedCapture
 
 pytest.importorskip("rosbags.rosbag2", reason="the extra bags is not installed")
+from rosbags.rosbag1 import Writer as WriterOfRos1
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 WIDTH, HEIGHT = 64, 48
 START = 345_600 * 10**9 + 9 * 3600 * 10**9  # Monday 9:00 of Unix time, ns
@@ -52,9 +55,6 @@ def image(k):
 
 def bag(folder, poses=11, pictures=5, pose_type="nav_msgs/msg/Odometry", shift=(), order=(), raw=True):
     """Write a rosbag of somebody's car: poses every 0.1 s, pictures every 0.2 s, scans 0.02 s after poses."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
     store = get_typestore(Stores.ROS2_HUMBLE)
     t = store.types
     shift, order = dict(shift), dict(order)
@@ -138,10 +138,6 @@ def test_a_bag_of_somebodys_car_becomes_captures(tmp_path, raw, pose_type):
 
 
 def test_rosbags_of_ros_1_and_ros_2_hold_the_same_drive(tmp_path):
-    from rosbags.rosbag1 import Writer as WriterOfRos1
-    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
     ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
     file, sqlite = bag(tmp_path / "bag"), tmp_path / "sqlite"
     with (
@@ -162,20 +158,19 @@ def test_rosbags_of_ros_1_and_ros_2_hold_the_same_drive(tmp_path):
     for path in (sqlite, sqlite / "sqlite.db3", tmp_path / "one.bag"):
         found = list(RecordedDrive(path, calibration).captures())
         assert len(found) == len(wanted) == 5
-        for (one, pose), (other, other_pose) in zip(wanted, found, strict=True):
-            assert one.time == other.time
-            np.testing.assert_array_equal(pose, other_pose)
-            pictures = [captured.capture.images["right"].image for captured in (one, other)]
-            np.testing.assert_array_equal(*pictures)
-            np.testing.assert_array_equal(one.capture.scans["front"], other.capture.scans["front"])
+        for sides in zip(wanted, found, strict=True):
+            one, other = (
+                (taken.time, pose, taken.capture.images["right"].image, taken.capture.scans["front"])
+                for taken, pose in sides
+            )
+            np.testing.assert_equal(one, other)
 
 
 def test_cars_are_searched_in_the_pictures_of_a_recording(tmp_path):
     (tmp_path / "drives").mkdir()
     bag(tmp_path / "drives/bag")
     for path in ("drives/bag/bag.mcap", "drives/bag", "drives"):
-        done = parkenv("detect", tmp_path / path, "--step", 2, "--out", tmp_path / "found")
-        assert done.returncode == 0, done.stderr
+        done = ran("detect --step 2", tmp_path / path, "--out", tmp_path / "found")
         assert ":/camera: 3 frames of 1.0 s, 0 boxes" in done.stdout
     (film,) = (tmp_path / "found").glob("*_camera_cars.mp4")
     video = Video.of(film)
@@ -230,21 +225,20 @@ def test_clocks_and_topics_that_do_not_fit_are_named_in_a_line(tmp_path, options
 
 def test_damaged_recordings_are_refused_in_a_line(tmp_path):
     whole = bag(tmp_path / "bag").read_bytes()
-    calibration = calibrated(tmp_path)
-    file = tmp_path / "bad.mcap"
+    calibration, file = calibrated(tmp_path), tmp_path / "bad.mcap"
     for content in (b"", b"I am text", whole[:100], whole[: len(whole) // 2], whole[:-20]):
         file.write_bytes(content)
         with pytest.raises(InputError, match=r"bad\.mcap: is not a complete recording \(.*\)") as caught:
             list(RecordedDrive(file, calibration).captures())
         assert "\n" not in str(caught.value)
     file.write_bytes(whole)
-    for path, given, message in (
-        (file, None, "was not made by parkenv survey --record; describe its sensors"),
-        (tmp_path / "none.mcap", None, "none.mcap: No such file"),
-        (tmp_path / "car.toml", None, "car.toml: is not a complete recording"),
+    for name, message in (
+        ("bad.mcap", "was not made by parkenv survey --record; describe its sensors"),
+        ("none.mcap", "none.mcap: No such file"),
+        ("car.toml", "car.toml: is not a complete recording"),
     ):
         with pytest.raises(InputError, match=message):
-            RecordedDrive(path, given)
+            RecordedDrive(tmp_path / name, None)
     with pytest.raises(InputError, match=r"/camera: image 1 is 64×48 px, want 96×48 as calibrated"):
         list(RecordedDrive(file, calibrated(tmp_path, CALIBRATION.replace("64", "96"))).captures())
     with pytest.raises(InputError, match=r"car\.toml: has no camera"):
@@ -266,12 +260,10 @@ def test_damaged_recordings_are_refused_in_a_line(tmp_path):
 )
 def test_a_recorded_survey_gives_the_same_map_to_the_last_bit(tmp_path, rig, errors, localise):
     file, words = tmp_path / "drive.mcap", ("--scenario", "mini", "--localise", localise)
-    driven = ("--sessions", 1, "--every", 5, *errors, "--rig", rig, "--jobs", 1, "--record", file)
-    done = parkenv("survey", *words, *driven, "--out", tmp_path / "survey")
-    assert done.returncode == 0, done.stderr
+    driven = ("--rig", rig, *errors, "--record", file, "--out", tmp_path / "survey")
+    done = ran("survey --sessions 1 --every 5 --jobs 1", *words, *driven)
     assert "--scenario mini" in " ".join(done.stdout.split())
-    done = parkenv("map-drive", file, *words, "--out", tmp_path / "mapped")
-    assert done.returncode == 0, done.stderr
+    ran("map-drive", file, *words, "--out", tmp_path / "mapped")
     lot = make_scenario("mini").lot
     sessions = []
     for folder in ("survey", "mapped"):

@@ -14,17 +14,13 @@ from sim_sensors.errors import SensorError
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import LEFT, RIGHT, Mount, SensorRig, poses_along
 
+LOT = packaged_lot("mini")
+POSE = np.array([*LOT.vertex_xy[2], LOT.vertex_yaw[2]])
+
 
 @pytest.fixture(scope="module")
 def scene():
-    lot = packaged_lot("mini")
-    return slot_lot(lot).scene(np.arange(lot.n_slots) % 3 != 0)
-
-
-@pytest.fixture(scope="module")
-def pose():
-    lot = packaged_lot("mini")
-    return np.array([*lot.vertex_xy[2], lot.vertex_yaw[2]])
+    return slot_lot(LOT).scene(np.arange(LOT.n_slots) % 3 != 0)
 
 
 def small(mount):
@@ -40,11 +36,11 @@ def test_mounts_turn_with_the_vehicle():
     assert mount.in_world(np.array([10.0, 20.0, math.pi / 2])) == pytest.approx((9.5, 21.0, 0.0))
 
 
-def test_smaller_pictures_show_the_same(scene, pose):
+def test_smaller_pictures_show_the_same(scene):
     large, small = SensorRig.thesis(), SensorRig.thesis().resized(320)
     (_, camera, _), (_, half, _) = large.cameras[0], small.cameras[0]
     assert (half.width, half.height, half.fx) == (320, 240, camera.fx / 2)
-    one, other = (rig.capture(scene, pose, seed=1).images["right"].image for rig in (large, small))
+    one, other = (rig.capture(scene, POSE, seed=1).images["right"].image for rig in (large, small))
     halved = one.reshape(240, 2, 320, 2, 3).mean(axis=(1, 3))
     assert np.abs(halved - other).mean() < 8.0
     stereo = SensorRig.stereo().resized(400)
@@ -53,13 +49,9 @@ def test_smaller_pictures_show_the_same(scene, pose):
         large.resized(0)
 
 
-def test_equal_seeds_give_equal_captures_and_other_seeds_other_noise(scene, pose):
+def test_equal_seeds_give_equal_captures_and_other_seeds_other_noise(scene):
     rig = small(Mount(z=1.1, yaw=RIGHT))
-    one, same, other = (
-        rig.capture(scene, pose, seed=1),
-        rig.capture(scene, pose, seed=1),
-        rig.capture(scene, pose, seed=2),
-    )
+    one, same, other = (rig.capture(scene, POSE, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.images["camera"].image, same.images["camera"].image)
     np.testing.assert_array_equal(one.scans["laser"], same.scans["laser"])
     assert (one.images["camera"].image != other.images["camera"].image).any()
@@ -68,13 +60,12 @@ def test_equal_seeds_give_equal_captures_and_other_seeds_other_noise(scene, pose
 
 
 @pytest.mark.parametrize("yaw", [RIGHT, LEFT])
-def test_beams_that_hit_a_vehicle_and_the_cameras_depth_agree(scene, pose, yaw):
+def test_beams_that_hit_a_vehicle_and_the_cameras_depth_agree(scene, yaw):
     """A level camera at the laser's height sees along its middle row what the beams measure."""
     rig = small(Mount(z=0.5, yaw=yaw))
-    capture = rig.capture(scene, pose, noise=False)
-    camera = rig.cameras[0][1]
-    laser = rig.lasers[0][1]
-    ranges, ids = laser.scan_with_ids(scene.scan_plane, (pose[0], pose[1], pose[2]))
+    capture = rig.capture(scene, POSE, noise=False)
+    (_, camera, _), (_, laser, _) = rig.cameras[0], rig.lasers[0]
+    ranges, ids = laser.scan_with_ids(scene.scan_plane, POSE)
     np.testing.assert_array_equal(ranges, capture.scans["laser"])
     frame = capture.images["camera"]
     bearing = laser.angles - yaw
@@ -105,19 +96,15 @@ def test_poses_lie_on_the_path_in_even_steps(points, every):
     hop = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     assert (hop <= every + 1e-6).all()
     length = np.hypot(*np.diff(path, axis=0).T).sum()
-    assert (
-        len(poses) == pytest.approx(length / every, abs=1.01) or len(poses) == math.ceil(length / every) + 1
-    )
+    count = length / every
+    assert len(poses) == pytest.approx(count, abs=1.01) or len(poses) == math.ceil(count) + 1
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: SensorRig(), "no sensor"),
-        (
-            lambda: SensorRig(lasers=(("a", LaserScanner(), Mount()), ("a", LaserScanner(), Mount()))),
-            "'a' is used twice",
-        ),
+        (lambda: SensorRig(lasers=(("a", LaserScanner(), Mount()),) * 2), "'a' is used twice"),
         (lambda: Mount(z=0.0), "z is 0.0"),
         (lambda: poses_along([[0, 0]], 1.0), "path has shape"),
         (lambda: poses_along([[0, 0], [0, 0]], 1.0), "no length"),

@@ -30,14 +30,12 @@ AROUND = {
 
 
 def rows_of_slots(n=20):
-    x = 2.5 * np.arange(n)
-    xy = np.concatenate([np.column_stack([x, 0 * x]), np.column_stack([x, 0 * x + 11])])
-    return xy, np.repeat([-np.pi / 2, np.pi / 2], n)
+    xy = [[2.5 * i, y] for y in (0.0, 11.0) for i in range(n)]
+    return np.array(xy), np.repeat([-np.pi / 2, np.pi / 2], n)
 
 
 def lot(n=20, **options):
-    xy, yaw = rows_of_slots(n)
-    return SlotLot(xy, yaw, 5.0, 2.5, **options)
+    return SlotLot(*rows_of_slots(n), 5.0, 2.5, **options)
 
 
 def test_a_scene_holds_what_it_was_given():
@@ -76,11 +74,8 @@ def test_the_pool_holds_every_mesh_and_its_coarse_one():
     vehicles = scene.instances.mesh[scene.instances.ids > 0]
     assert (count[pool.coarse[vehicles]] * 4 < count[vehicles]).all()
     assert np.array_equal(pool.coarse[pool.coarse], pool.coarse)
-    model = scene.fleet.models[1]
-    m = vehicles[1]
-    np.testing.assert_array_equal(
-        pool.vertices[pool.vertex_start[m] : pool.vertex_start[m + 1]], model.mesh().vertices
-    )
+    of_second = slice(*pool.vertex_start[vehicles[1] :][:2])
+    np.testing.assert_array_equal(pool.vertices[of_second], scene.fleet.models[1].mesh().vertices)
 
 
 def test_footprints_are_where_the_vehicles_stand():
@@ -145,8 +140,7 @@ def test_the_scan_plane_of_a_changed_scene_is_that_of_one_made_anew():
         assert "scan_plane" in vars(changed)
     anew = lot.scene(taken, number)
     scans = [LaserScanner().scan_with_ids(scene.scan_plane, poses) for scene in (changed, anew)]
-    for part in range(2):
-        np.testing.assert_array_equal(scans[0][part], scans[1][part])
+    np.testing.assert_equal(*scans)
 
 
 def test_the_car_in_a_slot_depends_on_seed_slot_and_arrival_alone():
@@ -184,8 +178,7 @@ def test_cars_park_as_the_manners_say():
     scene = parking.scene(np.ones(1500, bool))
     offset = scene.vehicle_pose[:, :2] - xy
     turn = np.mod(scene.vehicle_pose[:, 2] + np.pi / 2, np.pi) - np.pi / 2
-    assert offset[:, 1].std() == pytest.approx(0.12, rel=0.1)
-    assert offset[:, 0].std() == pytest.approx(0.20, rel=0.15)
+    assert offset.std(axis=0) == pytest.approx([0.20, 0.12], rel=0.1)
     assert turn.std() == pytest.approx(np.radians(1.5), rel=0.1)
     assert np.mean(np.abs(scene.vehicle_pose[:, 2]) > 1) == pytest.approx(0.25, abs=0.04)
 

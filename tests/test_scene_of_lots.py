@@ -26,8 +26,7 @@ def test_asphalt_is_where_cars_drive_and_park(name):
     assert kerbed.symmetric_difference(outline.area.around(np.zeros(2), 1e4)).area == pytest.approx(0.0)
     assert asphalt.contains(kerbed)
     assert all(asphalt.contains(shapely.Polygon(corners)) for corners in outline.slots)
-    stops = shapely.points(lot.vertex_xy[: lot.n_slots])
-    assert shapely.contains(asphalt, stops).all()
+    assert shapely.contains(asphalt, shapely.points(lot.vertex_xy[: lot.n_slots])).all()
     assert not any(asphalt.contains(shapely.Point(wall[0])) for wall in outline.walls)
 
 
@@ -49,12 +48,10 @@ def test_marks_lie_on_their_lanes_and_entries_lead_in(name):
 
 def test_painted_lines_leave_the_mouth_open():
     lot = packaged_lot("campus")
-    outline = LotScene.of(lot)
-    lines = shapely.linestrings(outline.slot_lines)
+    lines = shapely.linestrings(LotScene.of(lot).slot_lines)
     gap = shapely.distance(lines, shapely.points(lot.mouth_xy()))
     assert gap.min() > 1.0, "half a slot's width away from either side"
-    sides = shapely.length(lines)
-    np.testing.assert_allclose(sides, 2 * lot.slot_length + lot.slot_width)
+    np.testing.assert_allclose(shapely.length(lines), 2 * lot.slot_length + lot.slot_width)
 
 
 def test_the_page_draws_the_same_shapes_to_the_centimetre():

@@ -1,7 +1,7 @@
 """The car that drives: closed forms of the kinematic bicycle, limits, rest, symmetry; what it touches."""
 
-import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,9 +35,9 @@ def drive(car, state, acceleration, steering, steps=1):
     return np.array(states)
 
 
-def driven(pairs, start=None):
+def driven(pairs, speed=0.0):
     """The states that a row of commands leads through, one a step."""
-    states = [np.zeros(6) if start is None else np.array(start, dtype=float)]
+    states = [np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])]
     for acceleration, steering in pairs:
         states.append(drive(CAR, states[-1], acceleration, steering)[-1])
     return np.array(states)
@@ -57,19 +57,17 @@ def test_the_rear_axle_runs_on_a_circle_of_wheelbase_over_tan_steering(steering,
 def test_a_car_at_rest_stays_where_it_is(steering, steps):
     """Turning the wheels moves nothing."""
     path = drive(CAR, np.array([3.0, -2.0, 0.7, 0.0, 0.0, 0.0]), 0.0, steering, steps)
-    assert (path[:, :3] == path[0, :3]).all()
-    assert (path[:, SPEED] == 0.0).all()
+    assert (path[:, : SPEED + 1] == path[0, : SPEED + 1]).all()
 
 
 @given(pairs=commands)
 def test_all_limits_and_rates_are_kept(pairs):
     states = driven(pairs)
     change = np.abs(np.diff(states, axis=0))
-    assert (np.abs(states[:, STEERING]) <= CAR.max_steering).all()
-    assert (change[:, STEERING] <= CAR.steering_rate * PHYSICS_S + 1e-12).all()
-    assert (states[:, SPEED] <= CAR.max_speed).all()
-    assert (states[:, SPEED] >= -CAR.max_reverse_speed).all()
-    assert (change[:, SPEED] <= CAR.max_braking * PHYSICS_S + 1e-12).all()
+    assert np.abs(states[:, STEERING]).max() <= CAR.max_steering
+    assert change[:, STEERING].max() <= CAR.steering_rate * PHYSICS_S + 1e-12
+    assert -CAR.max_reverse_speed <= states[:, SPEED].min() <= states[:, SPEED].max() <= CAR.max_speed
+    assert change[:, SPEED].max() <= CAR.max_braking * PHYSICS_S + 1e-12
     faster = np.abs(states[1:, SPEED]) > np.abs(states[:-1, SPEED]) + 1e-12
     assert (change[faster, SPEED] <= CAR.max_acceleration * PHYSICS_S + 1e-12).all()
     # Only coming to rest and meeting a limit of the speed end an acceleration at once.
@@ -86,12 +84,11 @@ def test_brakes_take_energy_bring_the_car_to_rest_and_hold_it(speed, brake):
         states.append(drive(CAR, states[-1], -math.copysign(brake, speed), 0.0)[-1])
         assert abs(states[-1][SPEED]) < abs(states[-2][SPEED])
         assert states[-1][SPEED] * speed >= 0.0
-    rest = drive(CAR, states[-1], 0.0, 0.0, steps=10)
-    assert (rest[:, X] == rest[0, X]).all()
+    assert np.ptp(drive(CAR, states[-1], 0.0, 0.0, steps=10)[:, X]) == 0.0
 
 
 def test_the_way_to_a_halt_is_that_of_constant_braking():
-    soft = dataclasses.replace(CAR, acceleration_rate=1e6)
+    soft = replace(CAR, acceleration_rate=1e6)
     state = np.array([0.0, 0.0, 0.0, 5.0, 0.0, 0.0])
     while state[SPEED] > 0.0:
         advance(state, -1.0, 0.0, soft.limits)
@@ -100,8 +97,7 @@ def test_the_way_to_a_halt_is_that_of_constant_braking():
 
 @given(pairs=commands, speed=st.floats(-3.0, 3.0))
 def test_left_and_right_are_mirror_images(pairs, speed):
-    left = driven(pairs, [0.0, 0.0, 0.0, speed, 0.0, 0.0])
-    right = driven([(a, -s) for a, s in pairs], [0.0, 0.0, 0.0, speed, 0.0, 0.0])
+    left, right = driven(pairs, speed), driven([(a, -s) for a, s in pairs], speed)
     np.testing.assert_array_equal(left * [1, -1, -1, 1, -1, 1], right)
 
 
@@ -126,7 +122,7 @@ def test_an_arc_in_pieces_is_the_same_arc(curvature, way, pieces):
 )
 def test_a_car_that_cannot_be_is_refused(change, message):
     with pytest.raises(InputError, match=message):
-        dataclasses.replace(CAR, **change)
+        replace(CAR, **change)
 
 
 @given(
@@ -161,9 +157,8 @@ def test_what_is_touched_is_named(thing):
         space.move([[4.0, 0.0, 0.3]])
         assert space.touched(0.0, 0.0, 0.0) == thing
     else:
-        line = (
-            outline[:2] + np.array([0.0, 0.9]) if thing in (ObstacleKind.KERB, ObstacleKind.WALL) else outline
-        )
+        is_line = thing in (ObstacleKind.KERB, ObstacleKind.WALL)
+        line = outline[:2] + np.array([0.0, 0.9]) if is_line else outline
         space = CollisionWorld(CAR, Obstacles.of([(thing, line)]))
         assert space.touched(0.0, 1.5, 0.0) == ObstacleKind.NOTHING
         assert space.touched(3.0, 0.0, 0.0) == thing

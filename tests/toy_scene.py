@@ -16,13 +16,13 @@ class ToyScene:
     instances: Instances
     ground: Ground
 
-    def soup(self, glass=False):
+    def soup(self):
         """(n, 3, 3) float64, corners in the world of all triangles that are not glass."""
         parts = []
         for mesh, (x, y, z, yaw) in zip(self.instances.mesh, self.instances.pose, strict=True):
             vertices = self.pool.vertices[self.pool.vertex_start[mesh] : self.pool.vertex_start[mesh + 1]]
             chosen = slice(self.pool.triangle_start[mesh], self.pool.triangle_start[mesh + 1])
-            keep = glass | (self.pool.material[chosen] != Material.GLASS)
+            keep = self.pool.material[chosen] != Material.GLASS
             turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
             parts.append((vertices.astype(float) @ turn + (x, y, z))[self.pool.triangles[chosen][keep]])
         return np.concatenate(parts)
@@ -50,13 +50,9 @@ def box_mesh(length, width, height, material=Material.PAINT, color=(150, 30, 30)
             normal[axis] = sign
             normals.append(np.tile(normal, ((splits + 1) ** 2, 1)))
     faces = np.concatenate(triangles).astype(np.int32)
-    return Mesh(
-        np.concatenate(points).astype(np.float32),
-        np.concatenate(normals).astype(np.float32),
-        faces,
-        np.full(len(faces), material, dtype=np.uint8),
-        np.tile(np.array(color, dtype=np.uint8), (len(faces), 1)),
-    )
+    materials, colors = np.full(len(faces), material, np.uint8), np.tile(np.uint8(color), (len(faces), 1))
+    points, normals = (np.concatenate(part).astype(np.float32) for part in (points, normals))
+    return Mesh(points, normals, faces, materials, colors)
 
 
 def toy_scene(meshes, placed, ids, coarse=None, ground=None):
@@ -83,25 +79,12 @@ def random_boxes(seed, count=40):
     generator = np.random.default_rng(seed)
     materials = [Material.PAINT, Material.PAINT, Material.STONE, Material.GLASS]
     meshes = [
-        box_mesh(
-            *generator.uniform(0.5, 4.0, 3),
-            materials[i % 4],
-            generator.integers(20, 230, 3),
-            splits=i % 3 + 1,
-        )
+        box_mesh(*generator.uniform(0.5, 4.0, 3), materials[i % 4], generator.integers(20, 230, 3), i % 3 + 1)
         for i in range(8)
     ]
     angle, distance = generator.uniform(-np.pi, np.pi, count), generator.uniform(5.0, 40.0, count)
-    placed = np.stack(
-        [
-            generator.integers(0, len(meshes), count),
-            distance * np.cos(angle),
-            distance * np.sin(angle),
-            np.zeros(count),
-            generator.uniform(-np.pi, np.pi, count),
-        ],
-        axis=1,
-    )
+    which, yaw = generator.integers(0, len(meshes), count), generator.uniform(-np.pi, np.pi, count)
+    placed = np.column_stack([which, distance * np.cos(angle), distance * np.sin(angle), 0.0 * yaw, yaw])
     return toy_scene(meshes, placed, np.arange(1, count + 1))
 
 
@@ -129,7 +112,7 @@ def ray_depth(scene, camera, pose):
     return best.reshape(camera.height, camera.width)
 
 
-def parked_cars(rows: int = 4, columns: int = 50, models: int = 40) -> ToyScene:
+def parked_cars(columns=50, models=40):
     """Cars nose-in on both sides of a lane along x, no space left free; far ones have coarse meshes."""
     cars = [VehicleModel.from_seed(None, seed) for seed in range(models)]
     meshes = [car.mesh(level) for level in (DETAILED, COARSE) for car in cars]
@@ -137,7 +120,7 @@ def parked_cars(rows: int = 4, columns: int = 50, models: int = 40) -> ToyScene:
     generator = np.random.default_rng(0)
     placed = [
         (generator.integers(models), (column - (columns - 1) / 2.0) * 2.55, y, 0.0, math.pi / 2)
-        for y in (-6.0, -11.2, 6.0, 11.2)[:rows]
+        for y in (-6.0, -11.2, 6.0, 11.2)
         for column in range(columns)
     ]
-    return toy_scene(meshes, placed, range(1, rows * columns + 1), coarse.tolist())
+    return toy_scene(meshes, placed, range(1, len(placed) + 1), coarse.tolist())
