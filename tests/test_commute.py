@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,9 +35,8 @@ def spec(**changes):
 def write_log(path, days):
     lines = ["slot_id,datetime,occupied"]
     for day, taken in days.items():
-        lines += [
-            f"s{s},{day}T{hour:02}:00,{int(taken[s])}" for s in range(len(taken)) for hour in range(7, 20)
-        ]
+        for slot, one in enumerate(taken):
+            lines += [f"s{slot},{day}T{hour:02}:00,{int(one)}" for hour in range(7, 20)]
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -126,7 +124,7 @@ def test_drivers_come_on_the_next_weekdays_or_recorded_days(tmp_path):
 def test_a_map_of_a_commute_is_a_forecast(out, tmp_path):
     """A scenario file takes the map file of a course; a copy of it goes on learning elsewhere."""
     shutil.copy(out / "maps" / "mini_wrong_belief_0.sqlite", tmp_path / "map.sqlite")
-    Path(tmp_path / "known.toml").write_text('lot = "mini"\nforecast = "map.sqlite"\n')
+    (tmp_path / "known.toml").write_text('lot = "mini"\nforecast = "map.sqlite"\n')
     known = make_scenario(tmp_path / "known.toml")
     arrival = known.occupancy.draw_arrival(known.arrival, np.uint64(1))
     learned = known.forecast(arrival)
@@ -162,11 +160,9 @@ def test_a_log_keeps_its_slots_on_all_days_of_a_commute(tmp_path):
     commute = spec(scenarios=[str(tmp_path / "recorded.toml")], drivers=1)
     occupancy = commute.runs[0].scenario.occupancy
     anew = make_scenario(tmp_path / "recorded.toml").occupancy
-    slots, ranked = (
-        np.array([its.mapped_log(day).log_slot for day in its.log.days]) for its in (occupancy, anew)
-    )
-    assert (slots == slots[0]).all()
-    assert not (ranked == ranked[0]).all()
+    slots, ranked = ([its.mapped_log(d).log_slot for d in its.log.days] for its in (occupancy, anew))
+    assert (np.array(slots) == slots[0]).all()
+    assert not (np.array(ranked) == ranked[0]).all()
     # The fullest are nearest to the goal.
     mean = occupancy.log.mean_occupancy("weekday")[slots[0]]
     assert (np.diff(mean[np.argsort(occupancy.walk_m, kind="stable")]) <= 0.0).all()

@@ -45,22 +45,17 @@ def test_the_summary_is_what_the_episodes_say_and_jobs_do_not_matter(tmp_path):
     assert len(rows) == 3 * 2 * 2
     for row in rows:
         keys = ("agent", "failure_cost_s", "v_walk_kmh")
-        total = np.array(
-            [float(e["total_s"]) for e in episodes if all(e[key] == str(row[key]) for key in keys)]
-        )
-        assert row["total_s"] == pytest.approx(total.mean())
+        its = [float(e["total_s"]) for e in episodes if all(e[key] == str(row[key]) for key in keys)]
+        assert row["total_s"] == pytest.approx(np.mean(its))
         low, high = row["total_s_ci95"]
         assert low < row["total_s"] < high
-        assert row["total_s"] == pytest.approx(
-            row["drive_s"] + row["failed_s"] + row["walk_s"] + row["parking_cost_s"] + row["gave_up_s"]
-        )
+        terms = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
+        assert row["total_s"] == pytest.approx(sum(row[term] for term in terms))
         assert row["regret_s"] >= -1e-9
         assert row["episodes"] == 25
-    first, second = rows[0], rows[1]
-    assert second["difference_s"] == pytest.approx(second["total_s"] - first["total_s"])
-    summary = summary_of(one)
-    assert summary["command"][1] == "compare"
-    assert {"version", "seed", "rows"} <= summary.keys()
+    assert rows[1]["difference_s"] == pytest.approx(rows[1]["total_s"] - rows[0]["total_s"])
+    assert summary_of(one)["command"][1] == "compare"
+    assert {"version", "seed", "rows"} <= summary_of(one).keys()
 
 
 def test_figures_and_occupancy_levels(tmp_path):
@@ -155,12 +150,8 @@ def test_intervals_cover_the_mean_as_often_as_they_say():
     assert stats.binomtest(covered, 40, 0.95).pvalue > 0.01
 
 
-def test_degenerate_samples_have_sane_intervals():
-    assert mean_interval([3.0, 3.0]) == (3.0, 3.0, 3.0)
-    mean, low, high = mean_interval([4.0])
-    assert mean == 4.0
-    assert np.isnan(low)
-    assert np.isnan(high)
+def test_one_value_has_no_interval():
+    np.testing.assert_array_equal(mean_interval([4.0]), (4.0, np.nan, np.nan))
 
 
 def episode(seed, total, parked=True):
@@ -198,13 +189,10 @@ def test_an_agent_is_called_the_fastest_only_where_no_interval_includes_0(n, slo
 
 
 def test_where_a_search_gave_up_the_median_and_their_share_stand_beside_the_mean():
-    rows = [
-        summarize(
-            {"scenario": "mini", "agent": name},
-            [episode(s, t, parked=t < 1000.0) for s, t in enumerate(times)],
-        )
-        for name, times in (("mdp", [30.0, 40.0, 50.0, 1800.0]), ("belief", [30.0, 40.0, 50.0, 60.0]))
-    ]
+    rows = []
+    for name, last in (("mdp", 1800.0), ("belief", 60.0)):
+        searches = [episode(s, t, parked=t < 1000.0) for s, t in enumerate((30.0, 40.0, 50.0, last))]
+        rows.append(summarize({"scenario": "mini", "agent": name}, searches))
     assert (rows[0]["median_s"], rows[0]["gave_up_fraction"]) == (45.0, 0.25)
     shown = [column["key"] for column in table_of("rows", "Results", rows)["columns"]]
     assert {"median_s", "gave_up_fraction"} < set(shown)
@@ -224,31 +212,6 @@ def lot_file(tmp_path):
     path = tmp_path / "lot.geojson"
     write_lot(packaged_lot("mini"), path)
     return path
-
-
-@pytest.mark.parametrize(
-    ("arguments", "wanted"),
-    [
-        (["--agents", "mdp,gredy"], "unknown agent 'gredy'; did you mean 'greedy-goal'? known: mdp, mdp-static"),
-        (["--agents", "mdp(failure_s=90"], "agent 'mdp(failure_s=90', want NAME or NAME(OPTION=VALUE,...)"),
-        (["--agents", "mdp(solver=guess)"], "solver is 'guess', want one of"),
-        (["--agents", "belief(budget_ms=-1)"], "budget_ms is -1"),
-        (["--agents", "belief,mdp-tuned", "--failure-cost", "sweep"], "all agents plan on observations"),
-        (["--v-drive-kmh", "1e-300"], "--v-drive-kmh is 1e-300"),
-        (["--scenario", "mini,campus", "--agents", "exact"], "lot 'campus' has 189 slots"),
-        (["--occupancy", "log.csv"], "--occupancy is 'log.csv', want a file; there is none at"),
-        (["--hours", "22:00-02:00"], "--hours is '22:00-02:00', want"),
-        (["--resume"], "holds no run to resume"),
-        (["-n", "1000000000"], "episodes is 1000000000, want a number of at most"),
-        (["--sensor-model", "keen"], "--sensor-model is 'keen', want perfect, blind, laser, stereo or a file (.json)"),
-        (["--sensor-model", "odd.json"], "odd.json: want a sensor model, a JSON object"),
-        (["--rig", "radar"], "--rig is 'radar', want 'laser', 'stereo', 'both_sides' or 'camera'"),
-    ],
-)  # fmt: skip
-def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
-    (tmp_path / "odd.json").write_text("{}")
-    assert wanted in refused("compare", *arguments, "--out", "out", cwd=tmp_path)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -281,6 +244,5 @@ def test_going_on_notices_that_an_agent_of_your_own_has_changed(tmp_path):
     assert "agent files: mine:Mine was" in said
 
 
-def test_a_goal_may_lie_anywhere_and_plan_draws_one_scenario(tmp_path, lot_file):
+def test_a_goal_may_lie_anywhere(tmp_path, lot_file):
     ran("plan", "--lot", lot_file, "--goal", "5,5", "--out", tmp_path / "plan")
-    assert "want one" in refused("plan", "--scenario", "campus,jam")

@@ -55,9 +55,8 @@ def made():
             state = dict(zip(STATE, of_zones, strict=True))
             rows[-1].append(index | sums | state | dict.fromkeys(LONE, cars))  # lone searches tell nothing
     spaces = np.stack([capacity, np.zeros(N_ZONES)], axis=1)
-    zones = Zones(
-        tuple(map(str, range(N_ZONES))), np.zeros((N_ZONES, 2)), *[np.ones(1)] * 2, spaces, spaces, 60.0
-    )
+    names = tuple(map(str, range(N_ZONES)))
+    zones = Zones(names, np.zeros((N_ZONES, 2)), *[np.ones(1)] * 2, spaces, spaces, 60.0)
     return Paths.of({"made": Town(zones, ("all",), rows)}, MULTIPLES, 8)
 
 
@@ -111,19 +110,10 @@ def district(tmp_path_factory):
     (x0, y0), (x1, y1) = plain.slot_xy.min(axis=0), plain.slot_xy.max(axis=0)
     goals = [(x, y) for x in np.linspace(x0, x1, 3) for y in (y0 - 5.0, y1 + 5.0)]
     write_lot(ParkingLot(**features(plain) | {"goals": goals}), folder / "district.geojson")
-    spec = {
-        "lot": "district.geojson",
-        "arrivals": {"hours": "08:00-09:30"},
-        "demand": {
-            "shoppers": {
-                "arrivals_per_hour": 50,
-                "stay_s": 1800,
-                "patience_s": 400,
-                "goals": [3, 1, 1, 1, 1, 0],
-            },
-            "visitors": {"arrivals_per_hour": 20, "patience_s": 400, "goals": [1, 1, 1, 1, 1, 1]},
-        },
-    }
+    shoppers = {"arrivals_per_hour": 50, "stay_s": 1800, "patience_s": 400, "goals": [3, 1, 1, 1, 1, 0]}
+    visitors = {"arrivals_per_hour": 20, "patience_s": 400, "goals": [1, 1, 1, 1, 1, 1]}
+    spec = {"lot": "district.geojson", "arrivals": {"hours": "08:00-09:30"}}
+    spec["demand"] = {"shoppers": shoppers, "visitors": visitors}
     (folder / "district.json").write_text(json.dumps(spec))
     return folder / "district.json"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from command_line import parkenv, ran, refused, summary_of
+from command_line import ran, refused, summary_of
 from stored_rows import change_rows
 
 from parkenv import InputError
@@ -36,10 +36,8 @@ v_drive_kmh = [10, 15]
 
 @pytest.fixture
 def sweep(tmp_path):
-    (tmp_path / "own.toml").write_text(
-        'lot = "mini"\ncosts = { give_up_s = 60 }\nspeeds = { v_walk_kmh = 3 }\n'
-    )
-    file = tmp_path / "sweep.toml"
+    own, file = tmp_path / "own.toml", tmp_path / "sweep.toml"
+    own.write_text('lot = "mini"\ncosts = { give_up_s = 60 }\nspeeds = { v_walk_kmh = 3 }\n')
     file.write_text(SWEEP)
     return file
 
@@ -98,21 +96,17 @@ def test_options_build_the_same_specification_as_a_file(tmp_path, sweep):
 
 
 def test_a_scenario_may_be_called_like_a_blind_one_but_no_two_alike():
-    named = {"name": "x-blind", "lot": "mini"}
+    plain, named = ({"name": name, "lot": "mini"} for name in ("x", "x-blind"))
     spec = Comparison.parse({"agents": ["belief"], "scenarios": [named], "episodes": 2}, "test")
     assert [case.scenario.name for case, _ in spec.cases] == ["x-blind"]
-    plain = {"name": "x", "lot": "mini"}
     both = {"agents": ["mdp"], "scenarios": [plain, named], "grid": {"blind": True}, "episodes": 2}
     with pytest.raises(InputError, match="two scenarios are called 'x-blind'"):
         Comparison.parse(both, "test").check()
 
 
 def test_agents_with_options_are_read_from_words_and_tables():
-    assert split_agents("mdp(failure_s=90,gamma=0.9), ppo:a/b.zip,oracle") == [
-        "mdp(failure_s=90,gamma=0.9)",
-        "ppo:a/b.zip",
-        "oracle",
-    ]
+    words = ["mdp(failure_s=90,gamma=0.9)", "ppo:a/b.zip", "oracle"]
+    assert split_agents("mdp(failure_s=90,gamma=0.9), ppo:a/b.zip,oracle") == words
     table = parse_call("x:Y(a=1, b=2.5,c=true,d=word)")
     assert table == {"name": "x:Y", "a": 1, "b": 2.5, "c": True, "d": "word"}
     spec = AgentSpec.parse(table, "test")
@@ -137,7 +131,6 @@ def test_agents_with_options_are_read_from_words_and_tables():
         ("agents = [{ nam = 'mdp' }]", "agents.0.name is missing"),
         ("agents = ['mdp(failre_s=9)']", "agent 'mdp' has no option 'failre_s'"),
         ("agents = ['belief']\ngrid = { blind = true }", "all agents plan on observations: belief"),
-        ("episodes = 2000000", "agents x scenarios x grid x episodes is 16000000 searches, want at most 10000000"),
         ("grid = { v_walk_kmh = [4, -4] }", "grid.v_walk_kmh.1 is -4, want a number of at least 0.1"),
         ("grid = { failure_s = [nan] }", "grid.failure_s.0 is nan, want a finite number"),
         ("grid = { failure_s = [1, 1] }", "grid.failure_s is [1, 1], want different values; 1.0 is repeated"),
@@ -155,8 +148,9 @@ def test_a_grid_without_bounds_is_refused_before_any_work(tmp_path):
     axis = list(range(1, 1001))
     speeds = f"v_walk_kmh = {[v / 10 for v in axis]}\nv_drive_kmh = {[v / 5 for v in axis]}"
     text = f"episodes = 1\n[grid]\nfailure_s = {axis}\n{speeds}"
-    assert "is 8000000000 searches, want at most 10000000" in refusal(tmp_path, text)
-    assert "bad.toml: No such file" in parkenv("run", tmp_path / "none" / "bad.toml").stderr
+    assert "agents x scenarios x grid x episodes is 8000000000 searches, want at most" in refusal(
+        tmp_path, text
+    )
 
 
 def test_the_example_of_the_documentation_has_a_cell_for_every_combination():
@@ -169,7 +163,7 @@ def test_the_example_of_the_documentation_has_a_cell_for_every_combination():
 def test_files_are_valid_by_the_schemas_of_their_kinds(tmp_path):
     made = schemas()
     assert str(ROOT) not in json.dumps(made)  # no path of the machine on which they are written
-    assert parkenv("schema", "--out", tmp_path).returncode == 0
+    ran("schema --out", tmp_path)
     written = {file.name: json.loads(file.read_text()) for file in tmp_path.iterdir()}
     assert written == {f"{kind}.schema.json": schema for kind, schema in made.items()}
     for file, kind in ((COURTYARD / "courtyard.toml", "scenario"), (COURTYARD / "sweep.toml", "compare")):

@@ -36,9 +36,7 @@ def trace(name="mdp"):
 AGENTS = ("mdp", "greedy-goal", "first-free", "oracle")
 TOTALS = {name: np.linspace(30.0, 90.0, 10) for name in AGENTS}
 LAID_OUT = {
-    "split": lambda n: draw_time_split(
-        [row(name, failure_cost_s=float(c)) for c in range(n) for name in AGENTS]
-    ),
+    "split": lambda n: draw_time_split([row(name, failure_cost_s=c) for c in range(n) for name in AGENTS]),
     "searches": lambda n: draw_searches([trace(AGENTS[i % 4]) for i in range(n)]),
     "distribution": lambda n: draw_time_distribution({f"lot {i}": TOTALS for i in range(n)}),
 }
@@ -60,11 +58,9 @@ def test_bars_stack_the_terms_and_an_agent_off_the_scale_is_cut():
     assert left == 0.0
     assert 140.0 < limit < 200.0
     drive, failed, walk, price, gave_up = ([bar.get_width() for bar in bars] for bars in ax.containers)
-    assert drive == [30.0, 70.0, 30.0]
+    assert [drive, walk, gave_up] == [[30.0, 70.0, 30.0], [60.0, 60.0, 0.0], [0.0] * 3]
     assert failed == pytest.approx([5.0, 0.0, limit - 30.0])
-    assert walk == [60.0, 60.0, 0.0]
     assert price == pytest.approx([0.0, 10.0, 0.0])
-    assert gave_up == [0.0, 0.0, 0.0]
     assert [text.get_text() for text in ax.texts] == ["95 s", "140 s", "5,090 s"]
     assert [text.get_weight() for text in ax.texts] == ["bold", "normal", "normal"]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["mdp", "greedy-goal", "mdp-static"]
@@ -89,9 +85,8 @@ def test_lines_against_occupancy_are_labelled_where_they_end(tmp_path):
     assert np.diff(sorted(text.xyann[1] for text in ax.texts)).min() > 0.06 - 1e-9
     assert ax.get_ylim()[0] == 0.0
     assert ax.get_ylim()[1] < 200.0
-    assert [to_hex(line.get_color()) for line in ax.lines] == [
-        AGENT_COLORS[a] for a in ("mdp", "oracle", "random")
-    ]
+    colors = [AGENT_COLORS[agent] for agent in ("mdp", "oracle", "random")]
+    assert [to_hex(line.get_color()) for line in ax.lines] == colors
     swept = [r | {"failure_cost_s": c} for r in rows for c in (10.0, 90.0)]
     save_picture(draw_time_against_occupancy(swept), tmp_path / "occupancy.png")
     with Image.open(tmp_path / "occupancy.png") as image:
@@ -142,15 +137,14 @@ def test_figures_come_out_the_same_and_a_place_that_cannot_be_written_is_named(t
 def test_the_distribution_rises_by_one_search_at_its_total_time_and_marks_the_mean():
     quick, slow = np.array([30.0, 10.0, 20.0, 20.0]), np.array([40.0, 50.0, 60.0, 900.0])
     ax = draw_time_distribution({"campus": {"mdp": quick, "oracle": slow}}).axes[0]
-    curves = {
-        to_hex(line.get_color()): line.get_xydata() for line in ax.lines if line.get_drawstyle() != "default"
-    }
-    dots = {to_hex(line.get_color()): line for line in ax.lines if line.get_drawstyle() == "default"}
+    curves, dots = {}, {}
+    for line in ax.lines:
+        (dots if line.get_drawstyle() == "default" else curves)[to_hex(line.get_color())] = line
     end = ax.get_xlim()[1]
     assert 60.0 < end < 200.0, "one long search does not squash the rest"
     for name, times in (("mdp", quick), ("oracle", slow)):
         color = AGENT_COLORS["mdp"] if name == "mdp" else INK
-        x, share = curves[color].T
+        x, share = curves[color].get_data()
         for limit in (10.0, 20.0, 25.0, 55.0):
             assert share[x <= limit][-1:].sum() == 100.0 * np.mean(times <= limit)
         (at,), (height,) = dots[color].get_data()
@@ -181,9 +175,8 @@ def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_pat
 def test_only_asked_for_figures_are_drawn(tmp_path):
     flat = {"my_lot-constant-forecast-0.5": ("my_lot", 0.5)}
     table = [row(name, scenario=s) for name in ("mdp", "oracle") for s in ("my_lot", *flat)]
-    files = draw_figures(
-        ComparisonResults([], {}, table, (), flat), tmp_path, ("time_split", "time_against_map")
-    )
+    results = ComparisonResults([], {}, table, (), flat)
+    files = draw_figures(results, tmp_path, ("time_split", "time_against_map"))
     assert [file.name for file in files] == ["time_split_my_lot.png", "time_against_map_my_lot.png"]
     with Image.open(files[0]) as opened:
         assert opened.info[CAPTION] == "Where the time goes: my_lot"

@@ -89,9 +89,8 @@ def test_failed_attempts_and_queues_are_on_the_track():
     assert np.allclose(time_of[FAIL], cars["failed_s"], atol=0.1)
     assert np.allclose(time_of[QUEUE], cars["queued_s"], atol=0.5)
     assert cars["queued_s"].max() > 0.0
-    steps = fleet.steps
-    assert len(steps) == (cars["n_steps"] - (cars["slot"] >= 0)).sum()
-    assert (np.diff(steps["begin"]) >= 0.0).all()
+    assert len(fleet.steps) == (cars["n_steps"] - (cars["slot"] >= 0)).sum()
+    assert (np.diff(fleet.steps["begin"]) >= 0.0).all()
 
 
 def test_days_and_agents_can_be_chosen(run, tmp_path):

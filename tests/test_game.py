@@ -1,5 +1,6 @@
 """`parkenv play`: the page searches as Python does, is played by keys and fingers, and its scores are checked."""
 
+import itertools
 import json
 import re
 import shutil
@@ -27,10 +28,7 @@ NODE = shutil.which("node")
 
 
 def data_of(page):
-    text = re.search(
-        r'<script type="application/json" id="game-data">(.*?)</script>', page.read_text(), re.DOTALL
-    )
-    return json.loads(text[1])
+    return json.loads(re.search(r'id="game-data">(.*?)</script>', page.read_text(), re.DOTALL)[1])
 
 
 @pytest.fixture(scope="module")
@@ -82,12 +80,8 @@ def random_search(scenario, seed, rng, avoids_free, limit):
 
 
 def random_searches(scenario, seeds, limit=2_000):
-    rng = np.random.default_rng(7)
-    return [
-        (w, random_search(scenario, seed, rng, many, limit))
-        for w, seed in enumerate(seeds)
-        for many in (False, True)
-    ]
+    rng, each = np.random.default_rng(7), itertools.product(enumerate(seeds), (False, True))
+    return [(w, random_search(scenario, seed, rng, many, limit)) for (w, seed), many in each]
 
 
 def require_equal(searches, states):
@@ -110,9 +104,8 @@ def test_the_search_of_the_page_is_that_of_python(kind, tmp_path, monkeypatch):
         scenario = random_scenario(rng, kind, sensor)
         if kind == "timetable":
             scenario = scenario.replace(occupancy=Timetable(scenario.lot), prior=None)
-        games.append(
-            (game_data(scenario, [AgentSpec(name="oracle")], seeds), random_searches(scenario, seeds, limit))
-        )
+        data = game_data(scenario, [AgentSpec(name="oracle")], seeds)
+        games.append((data, random_searches(scenario, seeds, limit)))
     program = "\n".join((SCRIPTS / script).read_text() for script in ("search_track.js", "game_search.js"))
     program += f"""
     const games = {json.dumps([(data, [(w, its[0]) for w, its in searches]) for data, searches in games])};

@@ -1,6 +1,5 @@
 """Scenes of manoeuvres: files of all formats, the check of footprints, levels, and what is planned and driven."""
 
-import csv
 import dataclasses
 import json
 import math
@@ -10,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import shapely
-from command_line import parkenv
+from command_line import ran, refused, rows_in, summary_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -41,14 +40,9 @@ def tpcap_text(start, target, blocks):
     return ",".join(map(repr, map(float, numbers)))
 
 
-def parkbench_content(
-    lines, origin=(0.0, 0.0), frame=(0.0, 0.0), start=(1.0, 3.0, 0.0), target=(0.0, 0.0, 0.0)
-):
-    request = {
-        "m_startPosture": {"m_pose": list(start)},
-        "m_targetArea": {"m_targetPosture": {"m_pose": list(target)}},
-        "m_origin": list(origin),
-    }
+def parkbench_content(lines, origin=(0.0, 0.0), frame=(0.0, 0.0), target=(0.0, 0.0, 0.0)):
+    area = {"m_targetPosture": {"m_pose": list(target)}}
+    request = {"m_startPosture": {"m_pose": START}, "m_targetArea": area, "m_origin": list(origin)}
     nodes = [{"nfmPolygonObjectNodes": [{"m_x": x, "m_y": y} for x, y in line]} for line in lines]
     frame = {"PlanningRequest": request, "m_nfmOrigin": list(frame), "NfmAggregatedPolygonObjects": nodes}
     return {"Frames": {"0": frame}}
@@ -94,22 +88,21 @@ def test_every_format_says_the_same_scene_wherever_it_lies(tmp_path):
 
 
 def test_parkbench_is_read_in_the_frame_of_its_obstacles_without_what_lies_below_the_target(tmp_path):
-    car = TPCAP
     stop = [[-0.8, -1.5], [-0.8, 1.5]]  # across the parked car, and beyond its sides
     wall = [[8.0, -3.0], [8.0, 3.0]]
-    file = tmp_path / "scene.json"
-    file.write_text(
-        json.dumps(parkbench_content([stop, wall], (5.0, 1.0), (4.0, 1.0), target=(-1.0, 0.0, 0.0)))
+    file, content = (
+        tmp_path / "scene.json",
+        parkbench_content([stop, wall], (5.0, 1.0), (4.0, 1.0), (-1.0, 0.0, 0.0)),
     )
+    file.write_text(json.dumps(content))
     scene = read_scene(file)
-    assert scene.vehicle == car
+    assert scene.vehicle == TPCAP
     np.testing.assert_allclose(scene.start[:2] + scene.origin, [2.0, 3.0])
     np.testing.assert_allclose(scene.target[:2] + scene.origin, [0.0, 0.0])
     left = shapely.union_all(scene.shapes)
-    assert not left.intersects(shapely.Polygon(car.corners(scene.target)))
+    assert not left.intersects(shapely.Polygon(TPCAP.corners(scene.target)))
     # Either end of the wheel stop is still there, 0.4 to 0.5 m long, and the wall whole.
-    ends = left.length - 6.0
-    assert 0.8 <= ends <= 1.0
+    assert 0.8 <= left.length - 6.0 <= 1.0
     assert read_scene(file, VEHICLES["parkbench"]).vehicle == VEHICLES["parkbench"]
 
 
@@ -135,9 +128,8 @@ def test_the_tightest_slot_is_left_and_entered_within_all_limits(tmp_path):
     (tmp_path / "slot.toml").write_text(own_text())
     scene = read_scene(tmp_path / "slot.toml")
     made = park(scene)
-    judged = made.judged
-    assert judged.driven, judged
-    assert judged.clearance_m > 0.001
+    assert made.judged.driven, made.judged
+    assert made.judged.clearance_m > 0.001
     require_limits(made.states)
     assert np.abs(made.states[:, STEERING]).max() <= TPCAP.max_steering
     assert made.states[-1, SPEED] == 0.0
@@ -166,13 +158,12 @@ def test_scenes_are_planned_driven_and_judged(tmp_path):
     (tmp_path / "scenes" / "slot.csv").write_text(
         tpcap_text((3e6, 3.0, 0.0), (3e6 + 9.0, 0.0, 0.0), [np.add(BLOCKS[0], [3e6, 0.0])])
     )
-    done = parkenv("park --jobs 1 --report --cases", tmp_path / "scenes", "--out", out)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads((out / "summary.json").read_text())
+    ran("park --jobs 1 --report --cases", tmp_path / "scenes", "--out", out)
+    summary = summary_of(out)
     (row,) = summary["rows"]
     assert (row["case"], row["planned"], row["driven"], row["contact"]) == ("slot", True, True, False)
     assert summary["vehicles"] == [{"scenes": 1, **dataclasses.asdict(TPCAP)}]
-    lines = list(csv.DictReader((out / "trajectories.csv").open()))
+    lines = rows_in(out / "trajectories.csv")
     poses = np.array([[float(line[name]) for name in ("x_m", "y_m", "yaw_rad")] for line in lines])
     assert float(lines[-1]["time_s"]) == pytest.approx(row["time_s"])
     assert math.dist(poses[-1, :2], (3e6 + 9.0, 0.0)) == pytest.approx(row["error_m"], abs=1e-5)
@@ -195,16 +186,12 @@ def test_a_run_does_not_go_on_with_a_scene_that_has_changed(tmp_path):
 
 def test_levels_are_drawn_for_a_car_in_a_file_and_a_run_says_it_again(tmp_path):
     (tmp_path / "van.toml").write_text("length = 4.9\nwheelbase = 2.9\n")
-    words = ("--levels", "oblique-normal", "-n", "2", "--vehicle", "van.toml", "--no-figures", "--jobs", "1")
-    done = parkenv("park", *words, "--out", "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    ran("park --levels oblique-normal -n 2 --vehicle van.toml --no-figures --jobs 1 --out out", cwd=tmp_path)
+    summary = summary_of(tmp_path / "out")
     assert [row["driven"] for row in summary["agents"]] == [2]
-    assert summary["vehicles"] == [
-        {"scenes": 2, **dataclasses.asdict(VehicleParameters(length=4.9, wheelbase=2.9))}
-    ]
-    again = parkenv("run", "out/experiment.json", "--out", "again", cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
+    van = VehicleParameters(length=4.9, wheelbase=2.9)
+    assert summary["vehicles"] == [{"scenes": 2, **dataclasses.asdict(van)}]
+    ran("run out/experiment.json --out again", cwd=tmp_path)
     first, second = (tmp_path / f / "trajectories.csv" for f in ("out", "again"))
     assert first.read_bytes() == second.read_bytes()
 
@@ -223,10 +210,7 @@ BAD = {
     "open.toml": ("start = [0.0, 0.0, 0.0]", "target is missing"),
     "short.toml": (own_text(start=[0.0, 1.0]), "start"),
     "car.toml": (own_text(vehicle="tank"), "vehicle is 'tank'"),
-    "truck.toml": (
-        own_text(vehicle={"length": 5.0}).replace('{"length": 5.0}', "{lenght = 5.0}"),
-        "'lenght'",
-    ),
+    "truck.toml": (own_text(vehicle=0).replace("vehicle = 0", "vehicle = {lenght = 5.0}"), "'lenght'"),
     "hole.geojson": ('{"features": [{"geometry": {"type": "Point", "coordinates": [1, 2]}}]}', "features.0"),
     "empty": (None, "is not there"),
 }
@@ -237,11 +221,9 @@ def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
     text, wanted = BAD[name]
     if text is not None:
         (tmp_path / name).write_text(text)
-    done = parkenv("park", "--cases", name, "--out", "out", cwd=tmp_path)
-    assert done.returncode == 2
-    assert wanted in done.stderr
-    assert name in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    said = refused("park --out out --cases", name, cwd=tmp_path)
+    assert wanted in said
+    assert name in said
     assert not (tmp_path / "out").exists()
 
 
@@ -254,9 +236,7 @@ def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
     ],
 )
 def test_options_that_do_not_fit_are_refused(options, wanted, tmp_path):
-    done = parkenv(f"park {options} --out out", cwd=tmp_path)
-    assert done.returncode == 2
-    assert wanted in done.stderr
+    assert wanted in refused(f"park {options} --out out", cwd=tmp_path)
     assert not (tmp_path / "out").exists()
 
 

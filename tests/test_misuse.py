@@ -58,9 +58,7 @@ def test_other_makers_say_it_alike_and_name_what_is_near():
 
 @pytest.mark.parametrize("name", ["parkenv/Search-v2", "parkenv/SearchPerception-v2"])
 def test_the_local_observation_by_name_is_that_of_the_wrapper(name):
-    options = {"scenario": "mini"} | (
-        {"weather": "sunny", "picture_width": 160} if "Perception" in name else {}
-    )
+    options = OPTIONS[name] | ({"weather": "sunny", "picture_width": 160} if "Perception" in name else {})
     named = gym.make(name, observation="local", k=3, **options)
     wrapped = LocalObservation(gym.make(name, **options), k=3)
     rng = np.random.default_rng(0)

@@ -1,29 +1,25 @@
 """People at the keyboard, and films of what they did: Gymnasium's own `play` and `RecordVideo`."""
 
-from pathlib import Path
-from typing import Any
-
 import cv2
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers import RecordVideo
+from test_misuse import OPTIONS
 
 import parkenv  # noqa: F401  registers the environments
 
 pygame = pytest.importorskip("pygame")
 
 
-def played(
-    env: gym.Env[Any, Any], keys: list[list[int]], noop: Any, monkeypatch: pytest.MonkeyPatch
-) -> list[Any]:
+def played(env, keys, noop, monkeypatch):
     """The actions of a game in which these keys are held, one list a frame."""
     from gymnasium.utils.play import play
 
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    frames, held, actions = iter(keys), set[int](), []
+    frames, held, actions = iter(keys), set(), []
 
-    def events() -> list[Any]:
+    def events():
         wanted = set(next(frames, []))
         told = [pygame.event.Event(pygame.KEYDOWN, key=key) for key in wanted - held]
         told += [pygame.event.Event(pygame.KEYUP, key=key) for key in held - wanted]
@@ -36,27 +32,24 @@ def played(
     return actions
 
 
-def test_search_is_played_with_five_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_search_is_played_with_five_keys(monkeypatch):
     env = gym.make("parkenv/Search-v2", scenario="campus", render_mode="rgb_array")
     keys = [[pygame.K_w], [pygame.K_s], [pygame.K_a], [pygame.K_d], [pygame.K_SPACE]]
     assert played(env, keys, 4, monkeypatch) == [0, 1, 2, 3, 4]
 
 
-def test_drive_is_played_with_four_keys_and_two_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_is_played_with_four_keys_and_two_at_once(monkeypatch):
     env = gym.make("parkenv/Drive-v1", render_mode="rgb_array")
     keys = [[pygame.K_w], [pygame.K_w, pygame.K_a], [pygame.K_d, pygame.K_s]]
     actions = played(env, keys, np.zeros(2, dtype=np.float32), monkeypatch)
     assert np.array_equal(actions, [[1, 0], [1, 1], [-1, -1]])
 
 
-@pytest.mark.parametrize("name", ["Search", "SearchSensors", "SearchPerception", "Drive"])
-def test_every_environment_is_filmed(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_environment_is_filmed(name, tmp_path):
     pytest.importorskip("moviepy")
-    options = {"lot": "mini"} if name == "Drive" else {"scenario": "mini"}
-    version = 1 if name == "Drive" else 2
-    env = RecordVideo(
-        gym.make(f"parkenv/{name}-v{version}", render_mode="rgb_array", **options), str(tmp_path / "films")
-    )
+    env = gym.make(name, render_mode="rgb_array", **OPTIONS[name])
+    env = RecordVideo(env, str(tmp_path / "films"))
     env.reset(seed=0)
     env.action_space.seed(0)
     for _ in range(3):

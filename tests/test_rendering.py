@@ -51,27 +51,22 @@ def middle_of_slot(renderer, state, slot, along=0.0):
 def stand_in(env, p_occupied=None, observed=None, **changes):
     """The state of an environment, but for some of it."""
     state = env.unwrapped.state
-    belief = state.belief
-    if p_occupied is not None:
-        belief = dataclasses.replace(belief, p_occupied=p_occupied)
+    belief = state.belief if p_occupied is None else dataclasses.replace(state.belief, p_occupied=p_occupied)
     if observed is not None:
         belief.observed_at[:] = np.where(observed, 0.0, -1.0)
-    names = ("arrival", "time", "vertex", "path", "parked", "over", "failed_parks")
-    names += ("walk_s", "parking_cost_s", "total_s")
+    names = "arrival time vertex path parked over failed_parks walk_s parking_cost_s total_s".split()
     return SimpleNamespace(**{n: getattr(state, n) for n in names} | {"belief": belief} | changes)
 
 
 def test_frames_are_what_gymnasium_asks_for_and_do_not_depend_on_history():
     env = start(row_lot())
     first = env.render()
-    assert first.shape == (480, 640, 3)
-    assert first.dtype == np.uint8
+    assert (first.shape, first.dtype) == ((480, 640, 3), np.uint8)
     state = env.unwrapped.state
     occupied = state.world.occupied(np.arange(10), state.time)
     env.step(3)
     moved = env.render()
-    again = SearchRenderer(env.unwrapped.scenario)
-    assert np.array_equal(again.frame(state, occupied), moved)
+    assert np.array_equal(SearchRenderer(env.unwrapped.scenario).frame(state, occupied), moved)
     assert (first != moved).any(axis=2).sum() > 200
     first[:] = 0
     assert env.render().any()
@@ -105,9 +100,7 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
     assert renderer.frames.whole is None
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     env.reset(seed=0)
-    state = env.unwrapped.state
-    nothing = np.zeros(4000, dtype=bool)
-    frames = {}
+    nothing, frames = np.zeros(4000, dtype=bool), {}
     for vertex in (0, 2000, 3999, 0):
         state = stand_in(env, vertex=vertex, path=[vertex])
         frame = renderer.frame(state, nothing)
@@ -154,12 +147,10 @@ def test_a_full_lot_ends_at_a_junction_too():
 
 def test_text_tells_place_time_and_surroundings():
     env = start(row_lot())
-    renderer = SearchRenderer(env.unwrapped.scenario)
     p_occupied = np.insert(np.full(7, 0.5), 2, [0.0, 1.0, 0.0])
     moment = 86400 + 9 * 3600 + 41 * 60 + 7
     state = stand_in(env, p_occupied, vertex=3, path=[3], time=moment, arrival=Arrival(moment))
-    text = renderer.text(state)
-    lines = text.splitlines()
+    lines = SearchRenderer(env.unwrapped.scenario).text(state).splitlines()
     assert "at slot A3" in lines[0]
     assert "Tue 09:41:07" in lines[1]
     assert "A2 free, A3 taken, A4 free" in lines[2]

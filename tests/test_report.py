@@ -11,7 +11,6 @@ from command_line import ran, summary_of
 from stored_rows import change_rows
 
 from parkenv import InputError, make_scenario
-from parkenv.belief.slot_belief import SlotBelief
 from parkenv.cli.report import make_report
 from parkenv.files.known_names import UNBEATEN
 from parkenv.lots import packaged_lot, write_lot
@@ -23,7 +22,6 @@ from parkenv.studies.results import EPISODES
 from parkenv.studies.sensing.sessions import SESSIONS
 from parkenv.studies.study import ExecutionSpec, ReportOptions
 from parkenv.world.lot import PARK
-from planners import make_agent
 
 
 def data_of(page):
@@ -35,10 +33,8 @@ def data_of(page):
 def run(tmp_path_factory):
     """A small comparison, with its report."""
     out = tmp_path_factory.mktemp("report") / "compare"
-    options = (
-        "--agents mdp,belief,mdp-static,oracle --failure-cost 10,30 -n 4 --occupancy-levels none --seed 7"
-    )
-    ran(f"compare --scenario mini {options} --jobs 1 --report --out", out)
+    options = "--failure-cost 10,30 -n 4 --occupancy-levels none --seed 7 --jobs 1 --report"
+    ran(f"compare --scenario mini --agents mdp,belief,mdp-static,oracle {options} --out", out)
     return out
 
 
@@ -53,10 +49,8 @@ def test_the_tables_hold_every_number_of_the_summary(run):
     for row, cells in zip(rows, table["rows"], strict=True):
         shown = same | dict(zip(keys, cells, strict=True))
         for key, value in row.items():
-            if key.endswith("_ci95"):
-                base = key.removesuffix("_ci95")
-                # Four searches have no interval.
-                assert shown[base] == [row[base], None, None]
+            if key.endswith("_ci95"):  # four searches have no interval
+                assert shown[key.removesuffix("_ci95")] == [row[key.removesuffix("_ci95")], None, None]
             elif f"{key}_ci95" not in row and value and key != "median_s":
                 assert shown[key] == value
 
@@ -138,8 +132,7 @@ def test_folders_that_hold_no_finished_run_are_refused_in_words(tmp_path):
 
 
 def test_a_total_that_differs_is_told(run, tmp_path, capsys):
-    copy = tmp_path / "copy"
-    shutil.copytree(run, copy)
+    copy = shutil.copytree(run, tmp_path / "copy")
     first = iter([True])
     change_rows(copy, lambda row: next(first, None) and row.update(total_s=1.0))
     make_report(copy, ExecutionSpec(jobs=1))
@@ -150,11 +143,14 @@ def test_a_total_that_differs_is_told(run, tmp_path, capsys):
 
 
 def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
-    lot = tmp_path / "lot.geojson"
+    lot, out = tmp_path / "lot.geojson", tmp_path / "compare"
     write_lot(packaged_lot("mini"), lot)
-    out = tmp_path / "compare"
-    options = "--agents mdp,oracle -n 2 --occupancy-levels none --no-figures --jobs 1".split()
-    ran("compare", "--lot", lot, *options, "--out", out)
+    ran(
+        "compare --agents mdp,oracle -n 2 --occupancy-levels none --no-figures --jobs 1 --out",
+        out,
+        "--lot",
+        lot,
+    )
     make_report(out, ExecutionSpec(jobs=1))
     assert len(data_of(out / "report.html")["worlds"]) == 2
     lot.write_text(lot.read_text() + "\n")
@@ -167,10 +163,9 @@ def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
 
 def test_learning_curves_are_those_of_the_training(tmp_path):
     """Other trainings are shown by their medians."""
-    (tmp_path / "seed_3").mkdir()
-    (tmp_path / "seed_4").mkdir()
-    (tmp_path / "seed_4" / "curve.csv").write_text("step,total_s\n0,1\n")
-    (tmp_path / "seed_3" / "curve.csv").write_text("steps,total_s\n0,0.25\n500,0.5\n")
+    for seed, text in ((3, "steps,total_s\n0,0.25\n500,0.5\n"), (4, "step,total_s\n0,1\n")):
+        (tmp_path / f"seed_{seed}").mkdir()
+        (tmp_path / f"seed_{seed}" / "curve.csv").write_text(text)
     curve = [
         {"steps": steps, "total_s": value, "low_s": None, "high_s": None, "median_s": value - 0.125}
         for steps, value in ((0.0, 0.25), (500.0, 0.5))
@@ -232,31 +227,6 @@ def test_plans_are_ways_that_can_be_driven_and_begin_with_what_is_done(name):
             assert plan[0] == neighbors[vertex, action]
         planned += bool(plan)
     assert planned == 0 if name == "random" else planned > len(search["action"]) / 2
-
-
-def test_asking_belief_for_its_plan_changes_nothing():
-    scenario = make_scenario("mini")
-    case = Case(scenario, "belief")
-    recorded = replay(Encounter((case,), 11), {})["world"]["searches"][0]
-    assert recorded["total_s"] == case.run([11])[0]["total_s"]
-
-    agent = make_agent("belief", scenario)
-    observation = {
-        "vertex": np.int64(scenario.lot.entry_vertices[0]),
-        "time": np.array([3e4, 0.0], dtype=np.float32),
-        **SlotBelief.of_forecast(np.full(10, 0.5), np.full(10, 1e-4)).to_observation(),
-    }
-    action, memory = agent.predict(observation)
-    known = SlotBelief.of_observation(observation)
-
-    def held():
-        kept = memory.state, memory.missed_rate, memory.course.targets
-        return [np.array(value) for value in (memory.day.p_occupied(known.time), *kept)]
-
-    before = held()
-    assert agent.plan_preview(observation, int(action), memory)
-    for old, new in zip(before, held(), strict=True):
-        np.testing.assert_array_equal(old, new)
 
 
 def test_intervals_and_nested_figures_become_cells():

@@ -5,7 +5,6 @@ import errno
 import json
 import multiprocessing
 import os
-import re
 import resource
 import signal
 import subprocess
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import killed_once
 import pytest
-from command_line import parkenv
+from command_line import parkenv, refused
 
 from parkenv.errors import InputError
 from parkenv.files import atomic_write
@@ -30,9 +29,6 @@ from parkenv.studies.workers import Workers
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 
-COMMAND = (
-    "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures"
-)
 GONE_S = 5.0
 """Time until no process of a stopped run is left."""
 
@@ -49,8 +45,11 @@ def processes_with(mark):
 
 def test_a_stopped_command_leaves_no_process_and_says_how_to_go_on(tmp_path):
     out, mark = tmp_path / "out", f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
+    words = (
+        "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures"
+    )
     command = subprocess.Popen(
-        [sys.executable, "-m", "parkenv", *COMMAND.split(), "--jobs", "2", "--out", out],
+        [sys.executable, "-m", "parkenv", *words.split(), "--jobs", "2", "--out", out],
         env=os.environ | dict([mark.split("=")]),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
@@ -202,10 +201,7 @@ def test_a_folder_has_one_writer(tmp_path):
         holder.stdout.readline()
         assert not torn.exists()
         for command in ("compare", "survey"):
-            refused = parkenv(command, "--scenario", "mini", "--out", out)
-            assert refused.returncode == 2
-            assert f"out: process {holder.pid} on " in refused.stderr
-            assert len(refused.stderr.splitlines()) == 1
+            assert f"out: process {holder.pid} on " in refused(command, "--scenario", "mini", "--out", out)
         assert [path.name for path in out.iterdir()] == [LOCK]
     finally:
         holder.kill()
@@ -223,9 +219,9 @@ def test_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         for action in ("write_text", "unlink"):
             patched.setattr(Path, action, refuse)
-        with pytest.raises(InputError) as refused, atomic_write.atomic_write(path) as beside:
+        with pytest.raises(InputError) as caught, atomic_write.atomic_write(path) as beside:
             beside.write_text("{}")
-    assert str(refused.value) == f"{path}: cannot be written: Read-only file system"
+    assert str(caught.value) == f"{path}: cannot be written: Read-only file system"
     for name in ("", ".", "/"):
         with pytest.raises(InputError, match="is no name of a file"), atomic_write.atomic_write(name):
             pass
@@ -242,41 +238,42 @@ def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, command):
         json.dumps({"command": ["parkenv", "park"], "version": "0.1.0", "rows": [{"lot": "mini"}]})
     )
     (tmp_path / "file").touch()
-    refused = parkenv(*command, "--out", "file/made", cwd=tmp_path)
-    assert (refused.returncode, refused.stdout) == (2, "")
-    assert refused.stderr.startswith("parkenv: error: --out file")
-    assert ": cannot be written (" in refused.stderr
-    assert refused.stderr.count("\n") == 1
+    done = parkenv(*command, "--out", "file/made", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith("parkenv: error: --out file")
+    assert ": cannot be written (" in done.stderr
 
 
-@pytest.fixture
-def small_files():
-    """Lets this process write files of 2,000 bytes at most."""
+@contextlib.contextmanager
+def small_files(size):
+    """Let this process write files of so many bytes at most."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000, limits[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def test_a_full_disk_leaves_files_as_they_were(tmp_path, small_files):
+@small_files(2_000)
+def test_a_full_disk_leaves_files_as_they_were(tmp_path):
     path = tmp_path / "episodes.csv"
     path.write_text("one\n")
-    with (
-        pytest.raises(InputError, match="cannot be written: File too large"),
-        atomic_write.atomic_write(path) as new,
-    ):
+    with pytest.raises(InputError, match="written: File too large"), atomic_write.atomic_write(path) as new:
         new.write_text("x" * 3_000)
     assert path.read_text() == "one\n"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_map_that_cannot_be_written_leaves_no_file(tmp_path, small_files):
+@small_files(2_000)
+def test_a_map_that_cannot_be_written_leaves_no_file(tmp_path):
     with pytest.raises(InputError, match=r"m\.sqlite: cannot be written: .* the size of files limited"):
         MapStore(tmp_path / "m.sqlite", load_lot("mini"))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_that_belong_together_are_all_written_or_none(tmp_path, small_files):
+@small_files(2_000)
+def test_files_that_belong_together_are_all_written_or_none(tmp_path):
     (tmp_path / "a").write_text("before")
 
     def write(size):
@@ -285,9 +282,7 @@ def test_files_that_belong_together_are_all_written_or_none(tmp_path, small_file
                 with atomic_write.atomic_write(folder / name) as beside:
                     beside.write_text("x" * length)
 
-    with pytest.raises(
-        InputError, match=f"^{re.escape(str(tmp_path / 'b'))}: cannot be written: File too large"
-    ):
+    with pytest.raises(InputError, match=f"^{tmp_path / 'b'}: cannot be written: File too large"):
         write(3_000)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
     write(500)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import signal
 import sqlite3
 import subprocess
@@ -11,6 +10,7 @@ from pathlib import Path
 from zlib import crc32
 
 import pytest
+from test_stopped_runs import small_files
 from toy_study import Toy
 
 from parkenv import InputError
@@ -172,13 +172,9 @@ def changed(file, statement):
 
 
 def test_a_full_disk_ends_a_run_with_a_word_and_leaves_what_was_finished(tmp_path):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))
-    try:
-        with pytest.raises(InputError, match=r"results\.sqlite: cannot be written: .* is the disk full"):
-            run(LONG, tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    wanted = r"results\.sqlite: cannot be written: .* is the disk full"
+    with small_files(60_000), pytest.raises(InputError, match=wanted):
+        run(LONG, tmp_path)
     assert 0 < len(Toy.table.read(tmp_path)) < 80
     assert run(LONG, tmp_path, resume=True).rows == run(LONG).rows
 

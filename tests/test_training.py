@@ -11,11 +11,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from command_line import parkenv, refused
+from command_line import ran, refused, summary_of
 from gymnasium.vector import AutoresetMode
 from sb3_contrib import MaskablePPO
 from small_trainings import make_small, search_training, stop_training
-from stable_baselines3 import DQN, PPO
+from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
@@ -53,12 +53,14 @@ def trained(tmp_path_factory):
 
 def test_the_adapter_steps_as_the_batch_does_and_tells_of_ends_as_monitor_does():
     venv, batch = (
-        SearchVecEnv(6, "mini", reward_scale=0.01),
-        ParkSearchVectorEnv(6, "mini", observation="local", autoreset_mode=AutoresetMode.SAME_STEP),
+        SearchVecEnv(6, "mini", reward_scale=0.01, max_episode_steps=25),
+        ParkSearchVectorEnv(
+            6, "mini", observation="local", max_episode_steps=25, autoreset_mode=AutoresetMode.SAME_STEP
+        ),
     )
     venv.seed(3)
     observed, wanted = venv.reset(), batch.reset(seed=3)[0]
-    rng, returns, ends = np.random.default_rng(0), np.zeros(6), 0
+    rng, returns, cut = np.random.default_rng(0), np.zeros(6), []
     for _ in range(300):
         for name in wanted:
             np.testing.assert_array_equal(observed[name], wanted[name])
@@ -70,36 +72,17 @@ def test_the_adapter_steps_as_the_batch_does_and_tells_of_ends_as_monitor_does()
         np.testing.assert_array_equal(done, terminated | truncated)
         returns += in_seconds
         for i in np.flatnonzero(done):
-            ends += 1
+            cut.append(bool(truncated[i] and not terminated[i]))
             assert infos[i]["episode"]["r"] == pytest.approx(returns[i])
             assert infos[i]["total_s"] == pytest.approx(-returns[i])
-            assert infos[i]["TimeLimit.truncated"] == bool(truncated[i])
+            assert infos[i]["TimeLimit.truncated"] == cut[-1]
             np.testing.assert_array_equal(
                 infos[i]["terminal_observation"]["local"], told["final_obs"][i]["local"]
             )
             returns[i] = 0.0
         assert all(not infos[i] for i in np.flatnonzero(~done))
-    assert ends > 6
-
-
-def test_a_search_that_is_cut_off_says_so():
-    venv = SearchVecEnv(2, "campus", max_episode_steps=3)
-    venv.seed(0)
-    venv.reset()
-    for _ in range(3):
-        masks = venv.action_masks()
-        masks[:, 4] = False  # drive on
-        _, _, done, infos = venv.step(masks.argmax(axis=1))
-    assert done.all()
-    assert all(info["TimeLimit.truncated"] for info in infos)
-
-
-@pytest.mark.parametrize("algorithm", [PPO, DQN])
-def test_stable_baselines3_learns_on_the_adapter(algorithm):
-    venv = SearchVecEnv(4, ["mini", "campus"], reward_scale=0.01)
-    model = algorithm("MultiInputPolicy", venv, seed=0, **({"n_steps": 32} if algorithm is PPO else {}))
-    model.learn(256)
-    assert model.num_timesteps >= 256
+    assert len(cut) > 6
+    assert set(cut) == {False, True}
 
 
 @pytest.mark.parametrize(
@@ -186,14 +169,6 @@ def test_cloning_takes_the_read_only_arrays_of_a_worker():
     assert not torch.equal(before, model.policy.action_net.weight)
 
 
-@pytest.mark.filterwarnings("ignore:.*was trained on")
-def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
-    campus = make_scenario("campus")
-    model = LearnedAgent(campus, "maskable-ppo", trained / "model.safetensors").model
-    times, parked = episode_times(model, campus, range(4))
-    assert len(times) == len(parked) == 4
-
-
 def test_a_model_decides_on_driven_trips(trained):
     """On the lanes of the same world, it drives as in the search environment, as long as no attempt fails."""
     name = f"maskable-ppo:{trained / 'model.safetensors'}"
@@ -247,37 +222,33 @@ def encoded(mark):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "algorithm", "wanted"),
+    ("spoil", "wanted"),
     [
-        (lambda path, _: path.write_bytes(path.read_bytes()[:-2000]), "maskable-ppo", "its network cannot be read"),
-        (
-            lambda path, _: path.write_bytes(path.read_bytes()[:-4] + b"\0\0\xc0\x7f"),
-            "maskable-ppo",
-            "has weights that are no numbers",
-        ),
-        (written(b""), "maskable-ppo", "no model file, or a damaged one"),
-        (written(b"\xff" * 7 + b"\x00{" + b" " * 99), "maskable-ppo", "no model file, or a damaged one"),
-        (written(with_header(b"{" * 300_000)), "maskable-ppo", "header: "),
-        (written(with_header({"__metadata__": {}})), "maskable-ppo", "it has no card"),
-        (written(with_header({"__metadata__": {"parkenv": "[]"}})), "maskable-ppo", "card is a list, want a JSON"),
-        (pickled, "maskable-ppo", "pickled objects, which run code .* save_model"),
-        (lambda path, mark: path.write_bytes(pickle.dumps(Payload(mark))), "maskable-ppo", "no model file"),
-        (changed_card(policy_options={"net_arch": [10**9]}), "maskable-ppo", "net_arch"),
-        (changed_card(policy_options={"net_arch": [64]}), "maskable-ppo", "its network cannot be read"),
-        (changed_card(policy_options={"activation_fn": "Module"}), "maskable-ppo", "activation_fn is 'Module'"),
-        (changed_card(policy="os.system"), "maskable-ppo", "policy is 'os.system'"),
-        (changed_card(task="drive"), "maskable-ppo", "task is 'drive', want 'search'"),
-        (changed_card(observation="local-0"), "maskable-ppo", "observes 'local-0'"),
-        (lambda *_: None, "dqn", "is a model of maskable-ppo, not of dqn"),
-        (lambda path, _: path.unlink(), "maskable-ppo", "No such file"),
+        (lambda path, _: path.write_bytes(path.read_bytes()[:-2000]), "its network cannot be read"),
+        (lambda path, _: path.write_bytes(path.read_bytes()[:-4] + b"\0\0\xc0\x7f"), "has weights that are no numbers"),
+        (written(b""), "no model file, or a damaged one"),
+        (written(b"\xff" * 7 + b"\x00{" + b" " * 99), "no model file, or a damaged one"),
+        (written(with_header(b"{" * 300_000)), "header: "),
+        (written(with_header({"__metadata__": {}})), "it has no card"),
+        (written(with_header({"__metadata__": {"parkenv": "[]"}})), "card is a list, want a JSON"),
+        (pickled, "pickled objects, which run code .* save_model"),
+        (lambda path, mark: path.write_bytes(pickle.dumps(Payload(mark))), "no model file"),
+        (changed_card(policy_options={"net_arch": [10**9]}), "net_arch"),
+        (changed_card(policy_options={"net_arch": [64]}), "its network cannot be read"),
+        (changed_card(policy_options={"activation_fn": "Module"}), "activation_fn is 'Module'"),
+        (changed_card(policy="os.system"), "policy is 'os.system'"),
+        (changed_card(task="drive"), "task is 'drive', want 'search'"),
+        (changed_card(observation="local-0"), "observes 'local-0'"),
+        (changed_card(algorithm="dqn"), "is a model of dqn, not of maskable-ppo"),
+        (lambda path, _: path.unlink(), "No such file"),
     ],
 )  # fmt: skip
-def test_models_that_do_not_fit_are_refused_and_run_nothing(trained, tmp_path, spoil, algorithm, wanted):
+def test_models_that_do_not_fit_are_refused_and_run_nothing(trained, tmp_path, spoil, wanted):
     path, mark = tmp_path / "model.safetensors", tmp_path / "was_run"
     path.write_bytes((trained / "model.safetensors").read_bytes())
     spoil(path, mark)
     with pytest.raises(InputError, match=wanted):
-        make_agent(f"{algorithm}:{path}", SCENARIO)
+        make_agent(f"maskable-ppo:{path}", SCENARIO)
     assert not mark.exists()
 
 
@@ -303,17 +274,10 @@ def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
     assert not mark.exists()
 
 
-@pytest.fixture
-def checkpoint(tmp_path, monkeypatch):
-    """A small training that was stopped, and its checkpoint."""
+def test_a_checkpoint_that_does_not_fit_or_is_damaged_is_refused(tmp_path, monkeypatch):
     make_small(monkeypatch)
-    training = search_training("ppo", 1_100, 400, [SCENARIO])
+    training, path = search_training("ppo", 1_100, 400, [SCENARIO]), tmp_path / "checkpoint.pt"
     stop_training(training, tmp_path, monkeypatch)
-    return training, tmp_path / "checkpoint.pt"
-
-
-def test_a_checkpoint_that_does_not_fit_or_is_damaged_is_refused(checkpoint):
-    training, path = checkpoint
     data = bytearray(path.read_bytes())
     torch.save(torch.load(path, weights_only=True) | {"parameters": {}}, path)
     with pytest.raises(InputError, match="does not fit this training"):
@@ -370,16 +334,19 @@ def test_a_finished_training_goes_on_with_more_steps(tmp_path):
         run(long.changed(steps=2_000), tmp_path, resume=True)
 
 
-def test_observations_of_another_kind_are_refused(trained):
+def test_observations_of_another_kind_and_masks_that_allow_nothing_are_refused(trained):
     agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.safetensors")
     env = gym.make("parkenv/Search-v2", scenario=SCENARIO)
-    plain, _ = env.reset(seed=0)
-    with pytest.raises(InputError, match=r"wants observations of .*LocalObservation, got vertex, time"):
-        agent.predict(plain)
-    with pytest.raises(InputError, match="observes 86 numbers, got 102 for its k = 5"):
-        agent.predict(LocalObservation(env, k=7).reset(seed=0)[0])
-    with pytest.raises(InputError, match="action_mask allows nothing"):
-        agent.predict({"local": np.zeros(86, np.float32), "action_mask": np.zeros(5, np.int8)})
+    for observation, wanted in (
+        (env.reset(seed=0)[0], r"wants observations of .*LocalObservation, got vertex, time"),
+        (LocalObservation(env, k=7).reset(seed=0)[0], "observes 86 numbers, got 102 for its k = 5"),
+        (
+            {"local": np.zeros(86, np.float32), "action_mask": np.zeros(5, np.int8)},
+            "action_mask allows nothing",
+        ),
+    ):
+        with pytest.raises(InputError, match=wanted):
+            agent.predict(observation)
     with pytest.warns(UserWarning, match="was trained on .*, not on street$"):
         LearnedAgent(make_scenario("street"), "maskable-ppo", trained / "model.safetensors")
 
@@ -398,20 +365,19 @@ def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch
         "train", algorithm, "--scenario", "mini", "--steps", steps, "--trainings", 1,
         "--evaluate-every", 500, "--evaluation-episodes", 4, "--agents", "mdp", "--jobs", 1, "--out",
     ]  # fmt: skip
-    assert parkenv(*command, out).returncode == 0
+    ran(*command, out)
     assert "--resume" in refused(*command, out)
     # The curve of the first training is that of the longer run, too.
     curve = read_curve(out / "seed_0" / "curve.csv", ("steps", "total_s"))
-    assert parkenv(*command, out, "--resume", "--trainings", 2).returncode == 0
+    ran(*command, out, "--resume", "--trainings", 2)
     assert read_curve(out / "seed_0" / "curve.csv", ("steps", "total_s")) == curve
-    summary = json.loads((out / "summary.json").read_text())
-    assert [row["seed"] for row in summary["rows"]] == [0, 1]
-    assert all(row["steps"] >= steps for row in summary["rows"])
-    compared = parkenv(
+    rows = summary_of(out)["rows"]
+    assert [row["seed"] for row in rows] == [0, 1]
+    assert all(row["steps"] >= steps for row in rows)
+    ran(
         "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.safetensors'}",
         "-n", 2, "--occupancy-levels", "none", "--no-figures", "--jobs", 1, "--out", tmp_path / "compared",
     )  # fmt: skip
-    assert compared.returncode == 0, compared.stderr
 
 
 @pytest.mark.parametrize(

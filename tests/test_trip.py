@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_lots import CAR_PARKS
 
 from parkenv import InputError, make_scenario
 from parkenv.compiled.keyed_random import world_key
@@ -38,13 +39,6 @@ from sim_sensors.rig import SensorRig
 
 CAR = VehicleParameters()
 MINI = make_scenario("mini")
-LOTS = ("campus", "jam", "street", "mini")
-
-
-@lru_cache
-def lines_of(name):
-    lot = packaged_lot(name)
-    return lot, DrivenLines(lot)
 
 
 @lru_cache
@@ -59,13 +53,8 @@ class Calling(Observer):
     """Calls a function with every observation."""
 
     def __init__(self, function):
-        self.function = function
-
-    def on_reset(self, env, observation):
-        self.function(observation)
-
-    def on_step(self, step):
-        self.function(step.next_observation)
+        self.on_reset = lambda _, observation: function(observation)
+        self.on_step = lambda step: function(step.next_observation)
 
 
 class GraphExecutor:
@@ -92,20 +81,10 @@ class GraphExecutor:
         return None
 
 
-def started(name, seed=0, **kinds):
-    """A driver in the world of a seed, at the entry, and the world."""
-    scenario = make_scenario(name)
-    driver = VehicleController(scenario, **kinds)
-    key = world_key(seed, 0)
-    arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
-    world = scenario.occupancy.world(key, arrival)
-    driver.begin(key, world, int(scenario.lot.entry_vertices[0]), arrival.time)
-    return driver, world, arrival
-
-
-@pytest.mark.parametrize("name", LOTS)
+@pytest.mark.parametrize("name", CAR_PARKS)
 def test_every_edge_lies_on_a_line_that_keeps_right_and_is_as_long_as_the_graph_says(name):
-    lot, lines = lines_of(name)
+    lot = packaged_lot(name)
+    lines = DrivenLines(lot)
     source, column = np.nonzero(lot.neighbors >= 0)
     across = 0
     for v, c in zip(source.tolist(), column.tolist(), strict=True):
@@ -139,11 +118,8 @@ def test_a_rounded_polyline_ends_where_the_polyline_does_and_turns_no_tighter_th
     poses, curvature, _ = path.sampled(0.1)
     np.testing.assert_allclose(poses[-1, :2], points[-1], atol=1e-3)
     assert math.remainder(poses[-1, 2] - yaw[-1], 2 * math.pi) == pytest.approx(0.0, abs=1e-4)
-    room = (
-        0.5 * leg / math.tan(0.5 * max(abs(t) for t in turns))
-        if any(abs(t) > 1e-4 for t in turns)
-        else np.inf
-    )
+    sharpest = max(abs(t) for t in turns)
+    room = 0.5 * leg / math.tan(0.5 * sharpest) if sharpest > 1e-4 else np.inf
     assert np.abs(curvature).max() <= 1.0 / min(radius, room) + 1e-9
     assert path.driven_m <= leg * (len(turns) + 1) + 1e-9
 
@@ -171,7 +147,6 @@ def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(
 
 
 def test_with_the_graphs_times_a_trip_is_the_search_itself():
-    """With the graph's times instead of driven ones, every decision and time equals that of Search-v2."""
     scenario = blind_scenario(MINI)
     agent = make_agent("mdp", scenario)
     plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphExecutor(scenario))
@@ -228,13 +203,8 @@ def test_equal_seeds_give_equal_trips_whatever_was_driven_before():
     assert DrivenSearch(search.scenario).run(7) == first
 
 
-@lru_cache
-def with_sensors(captures=2):
-    return DrivenSearch(MINI, rig="laser", weather="sunny", captures=captures)
-
-
 def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_car_was():
-    search = with_sensors()
+    search = DrivenSearch(MINI, rig="laser", weather="sunny", captures=2)
     env, driver = search.env, search.driver
     poses, told = [], []
 
@@ -257,9 +227,8 @@ def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_ca
     times = np.array([pose[0] for pose in poses])
     assert len(times) > len(first.legs) / 2
     assert (np.diff(times) > 0.0).all()
-    offset = np.abs([y for _, _, y, _ in poses])
-    assert offset.max() > 0.0
-    assert offset.max() < 1.5, "on the lane, right of its middle, and not on the graph's vertices"
+    aside = max(abs(y) for _, _, y, _ in poses)
+    assert 0.0 < aside < 1.5, "on the lane, right of its middle, and not on the graph's vertices"
     before, poses[:], told[:] = list(poses), [], []
     search.run(3)
     assert search.run(2, [Calling(keep)]) == first
@@ -268,7 +237,7 @@ def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_ca
 
 def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monkeypatch):
     """A car whose sensors are shown an empty lot believes it, however full the lot is."""
-    search = with_sensors(captures=1)
+    search = DrivenSearch(MINI, rig="laser", weather="sunny", captures=1)
     env, sampler, lot = search.env, search.env.perception.sampler, MINI.lot
     measure, scene = sampler.sample, LotScenes.at
 
@@ -296,10 +265,6 @@ def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monke
         assert ((believed == truth) if show_all else ~believed)[seen & truth].mean() >= 0.75
 
 
-def busy(name, cars, pedestrians):
-    return make_scenario(name, traffic=Traffic(cars, pedestrians))
-
-
 @pytest.mark.parametrize(
     ("name", "cars", "pedestrians", "seeds"),
     [
@@ -309,7 +274,7 @@ def busy(name, cars, pedestrians):
     ],
 )
 def test_among_others_trips_take_longer_and_end_parked_without_a_contact(name, cars, pedestrians, seeds):
-    alone, among = searched(name), DrivenSearch(busy(name, cars, pedestrians))
+    alone, among = searched(name), DrivenSearch(make_scenario(name, traffic=Traffic(cars, pedestrians)))
     waited = lost = 0.0
     for seed in seeds:
         trip, quiet = among.run(seed), alone.run(seed)
@@ -326,7 +291,7 @@ def test_among_others_trips_take_longer_and_end_parked_without_a_contact(name, c
 
 
 def test_others_are_in_the_pictures_where_the_car_meets_them(monkeypatch):
-    search = DrivenSearch(busy("mini", 1, 1), rig="laser", weather="sunny", captures=1)
+    search = DrivenSearch(MINI.replace(traffic=Traffic(1, 1)), rig="laser", weather="sunny", captures=1)
     driver, met = search.driver, []
     capture = SensorRig.capture
 
@@ -349,20 +314,17 @@ def test_others_are_in_the_pictures_where_the_car_meets_them(monkeypatch):
     assert checked > 0
 
 
-def first_slot(driver):
-    lot = driver.scenario.lot
-    v = int(lot.entry_vertices[0])
-    c = int(np.flatnonzero(lot.neighbors[v] >= 0)[0])
-    driver.drive(v, c)
-    return int(lot.neighbors[v, c])
-
-
 def test_a_failed_try_takes_longer_the_later_it_is_noticed_and_ends_on_the_lane():
-    seconds = []
+    seconds, entry = [], int(MINI.lot.entry_vertices[0])
+    column = int(np.flatnonzero(MINI.lot.neighbors[entry] >= 0)[0])
+    slot = int(MINI.lot.neighbors[entry, column])
     for notice_m in (0.8, 4.0, 30.0):
         for seed in range(30):
-            driver, world, arrival = started("mini", seed, style=DrivingStyle(notice_m=notice_m))
-            slot = first_slot(driver)
+            driver, key = VehicleController(MINI, style=DrivingStyle(notice_m=notice_m)), world_key(seed, 0)
+            arrival = MINI.occupancy.draw_arrival(MINI.arrival, key)
+            world = MINI.occupancy.world(key, arrival)
+            driver.begin(key, world, entry, arrival.time)
+            driver.drive(entry, column)
             if world.occupied([slot], driver.car.time)[0]:
                 break
         result = driver.park(slot, taken=True)

@@ -53,8 +53,8 @@ def test_an_experiment_file_that_names_a_class_shows_it_and_asks_for_trust(modul
 
 def test_a_cluster_in_a_file_asks_for_trust(tmp_path):
     cluster = {"backend": "dask", "address": "tcp://theirs.example:8786"}
-    compared = {"kind": "compare", "scenarios": ["mini"], "agents": ["theirs:Mine"]} | cluster
-    (tmp_path / "experiment.json").write_text(json.dumps(compared))
+    compared = {"kind": "compare", "scenarios": ["mini"], "agents": ["theirs:Mine"]}
+    (tmp_path / "experiment.json").write_text(json.dumps(compared | cluster))
     asked = f"would run tasks on the cluster at {cluster['address']}; read"
     resumed = ("compare", "--resume", "--agents", "mdp", "--out", tmp_path)
     assert asked in refused(*resumed)

@@ -128,24 +128,14 @@ def test_an_interruption_is_one_whatever_it_is_wrapped_in():
         ((1, "slurm"), "backend is 'slurm', want one of loky, ray, dask"),
         ((1, "loky", "localhost:1"), "address requires the backend ray or dask"),
         ((0,), "jobs is 0, want at least 1"),
+        ((2, "ray", "127.0.0.1:9"), "no cluster answers"),
+        ((2, "dask", "tcp://127.0.0.1:9"), "no cluster answers"),
+        ((2, "dask", "tcp://somewhere"), "want HOST:PORT"),
+        ((2, "ray", "127.0.0.1:notaport"), "want HOST:PORT"),
     ],
 )
-def test_what_does_not_go_together_is_refused(arguments, wanted):
-    with pytest.raises(InputError, match=wanted):
-        Workers(*arguments)
-
-
-@pytest.mark.parametrize(
-    ("backend", "address", "wanted"),
-    [
-        ("ray", "127.0.0.1:9", "no cluster answers"),
-        ("dask", "tcp://127.0.0.1:9", "no cluster answers"),
-        ("dask", "tcp://somewhere", "want HOST:PORT"),
-        ("ray", "127.0.0.1:notaport", "want HOST:PORT"),
-    ],
-)
-def test_an_address_where_nobody_listens_is_refused_at_once(backend, address, wanted):
+def test_what_does_not_go_together_or_answer_is_refused_at_once(arguments, wanted):
     start = time.monotonic()
-    with pytest.raises(InputError, match=wanted), Workers(2, backend, address):
+    with pytest.raises(InputError, match=wanted), Workers(*arguments):
         pass
     assert time.monotonic() - start < 15.0
