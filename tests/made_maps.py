@@ -103,10 +103,12 @@ class Map:
                 feature(f"node/{number[point]}", tags, "Point", at[number[point]])
         return json.dumps({"type": "FeatureCollection", "features": features})
 
-    def draft(self, tmp_path, **options):
-        path = tmp_path / "place.osm"
+    def write(self, path):
         path.write_text(self.xml(), encoding="utf-8")
-        return import_lot(path, ImportOptions(**options))
+        return path
+
+    def draft(self, tmp_path, **options):
+        return import_lot(self.write(tmp_path / "place.osm"), ImportOptions(**options))
 
 
 def car_park():
@@ -136,8 +138,3 @@ def one_street(length=100.0, **tags):
     """A street without crossings, and a house."""
     place = Map().way([(0, 0), (length, 0)], {"highway": "residential", **tags})
     return place.box(30, 20, 50, 30, {"building": "house"})
-
-
-def crossing_streets(**second):
-    place = Map().way([(0, 0), (50, 0), (100, 0)], STREET, **{"parking:both": "lane"})
-    return place.way([(50, 0), (50, 60)], second).box(20, 20, 30, 30, {"building": "yes"})

@@ -16,16 +16,14 @@ import pytest
 from file_mutations import mutated_bytes, mutated_json, mutated_text
 from made_maps import car_park
 
-from parkenv import InputError, OccupancyLog, OccupancyProcess, SensorModel
+from parkenv import InputError, OccupancyLog, OccupancyProcess, SensorModel, make_scenario
 from parkenv.files.images import read_image
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.mapping.store import MapStore, Session
 from parkenv.perception.car_datasets import read_uiuc_test
 from parkenv.perception.car_model import CarModel
-from parkenv.scenarios.build import build
 from parkenv.scenarios.calibration import Calibration
-from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.report.page import write_page
 from parkenv.studies.benchmark.suite import Suite, check_result
 from parkenv.studies.compare.comparison import Comparison
@@ -77,10 +75,6 @@ def mapped(path):
         store.log()
 
 
-def scenario(path):
-    build(ScenarioSpec.read(path))
-
-
 def stored(path):
     """The store of a run with two searches."""
     with Results(path.parent) as results:
@@ -113,10 +107,6 @@ def true_locations(path):
     for number in range(2):
         (path.parent / "TestImages" / f"test-{number}.pgm").write_bytes(image(".pgm"))
     read_uiuc_test(path.parent, "single")
-
-
-def benchmark(path):
-    check_result(path)
 
 
 LOG = "datetime,camera,slot_id,weather,occupied\n" + "".join(
@@ -245,14 +235,14 @@ FORMATS = {
     "log.csv.gz": Format(LOG.encode(), mutated_bytes, OccupancyLog.read),
     "process.json": Format(PROCESS, mutated_json, OccupancyProcess.from_file),
     "model.json": Format(MODEL, mutated_json, sensor_model),
-    "scenario.toml": Format(SCENARIO, mutated_text, scenario),
-    "scenario.json": Format(tomllib.loads(SCENARIO), mutated_json, scenario),
+    "scenario.toml": Format(SCENARIO, mutated_text, make_scenario),
+    "scenario.json": Format(tomllib.loads(SCENARIO), mutated_json, make_scenario),
     "experiment.json": Format(EXPERIMENT, mutated_json, Comparison.read),
     "calibrated.json": Format(CALIBRATION, mutated_json, Calibration.from_file),
     "map.sqlite": Format(written(map_file), mutated_bytes, mapped),
     "model.npz": Format((ROOT / "perception/models/side.npz").read_bytes(), mutated_bytes, CarModel.load),
     "trueLocations.txt": Format("0: (-5,30)\n1: (2,3) (4,5)\n", mutated_text, true_locations),
-    "result.json": Format(RESULT, mutated_json, benchmark),
+    "result.json": Format(RESULT, mutated_json, check_result),
     "summary.json": Format(SUMMARY, mutated_json, reported),
     "fleet.json": Format(FLEET_SUMMARY, mutated_json, reported_kind),
     "results.sqlite": Format(written(stored), mutated_bytes, resumed),
@@ -261,15 +251,11 @@ FORMATS = {
     f"image{end}": Format(image(end), mutated_bytes, read_image)
     for end in (".png", ".jpg", ".pgm", ".bmp", ".webp")
 }
-BESIDE = {
-    "results.sqlite": {"settings.json": '{"seed": 0, "agents": {}}'},
-}
-"""Other files that stand in the folder of a file."""
 
 
 def read(name, content, folder):
-    for beside, text in BESIDE.get(name, {}).items():
-        (folder / beside).write_text(text)
+    if name == "results.sqlite":
+        (folder / "settings.json").write_text('{"seed": 0, "agents": {}}')
     (folder / name).write_bytes(content)
     FORMATS[name].read(folder / name)
 

@@ -12,17 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from made_maps import (
-    AISLE,
-    SERVICE,
-    SPACE,
-    STREET,
-    Map,
-    car_park,
-    crossing_streets,
-    one_street,
-    outline_alone,
-)
+from made_maps import AISLE, SERVICE, SPACE, STREET, Map, car_park, one_street, outline_alone
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.errors import InputError
@@ -84,6 +74,11 @@ def space(**tags):
     return car_park().box(42, 3, 44.5, 8, SPACE, **tags)
 
 
+def crossing(kind):
+    place = Map().way([(0, 0), (50, 0), (100, 0)], STREET, **{"parking:both": "lane"})
+    return place.way([(50, 0), (50, 60)], {"highway": kind}).box(20, 20, 30, 30, {"building": "yes"})
+
+
 RIGHT = "parking:right"
 MAPS = {
     "car park": car_park(),
@@ -127,9 +122,9 @@ MAPS = {
     "width: one-way": one_street(**{RIGHT: "lane"}, oneway="yes"),
     "width: tagged": one_street(**{RIGHT: "lane"}, width="10"),
     "width: on the kerb": one_street(**{RIGHT: "on_kerb"}, width="10 m"),
-    "crossing: street": crossing_streets(highway="residential"),
-    "crossing: service": crossing_streets(highway="service"),
-    "crossing: footway": crossing_streets(highway="footway"),
+    "crossing: street": crossing("residential"),
+    "crossing: service": crossing("service"),
+    "crossing: footway": crossing("footway"),
     "one-way exit": car_park().way([(50, 0), (60, -20)], SERVICE, oneway="yes"),
     "second way in": car_park().way([(60, -20), (50, 0)], SERVICE, oneway="yes"),
     "blind ends": blind_ends(),
@@ -176,9 +171,8 @@ def test_a_map_becomes_its_lot(tmp_path, name):
 def _numbers(values):
     """All numbers of nested lists and tables, in order."""
     if isinstance(values, dict | list):
-        return [
-            n for part in (values.values() if isinstance(values, dict) else values) for n in _numbers(part)
-        ]
+        parts = values.values() if isinstance(values, dict) else values
+        return [n for part in parts for n in _numbers(part)]
     return [values]
 
 
@@ -196,7 +190,5 @@ def assert_sound(lot):
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as place:
         lots = {name: described(name, Path(place))[1] for name in MAPS}
-    lines = ",\n".join(
-        f"{json.dumps(name)}: {json.dumps(lot, ensure_ascii=False)}" for name, lot in lots.items()
-    )
-    GOLDENS.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
+    lines = [f"{json.dumps(name)}: {json.dumps(lot, ensure_ascii=False)}" for name, lot in lots.items()]
+    GOLDENS.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")

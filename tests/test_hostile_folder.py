@@ -6,8 +6,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib as mpl
+import numpy as np
 import pytest
 from command_line import PARKENV
+
+from parkenv import make_scenario
+from parkenv.show.figures.fleet import CarParkDays, save_counted_demand
+from parkenv.show.figures.forecast import save_rates
+from parkenv.show.figures.lot import save_lot_picture
 
 COMMAND = [PARKENV[0], "-P", *PARKENV[1:]]
 """The command as it is installed: Python does not look for modules in the working folder."""
@@ -107,18 +114,8 @@ def test_an_import_changes_no_settings_of_a_users_own_process(folder):
 
 
 def test_figures_have_one_style_whatever_the_users_settings_are(tmp_path):
-    import matplotlib as mpl
-    import numpy as np
-
-    from parkenv import make_scenario
-    from parkenv.show.figures.fleet import CarParkDays, save_counted_demand
-    from parkenv.show.figures.forecast import save_rates
-    from parkenv.show.figures.lot import save_lot_picture
-
-    scenario, days = (
-        make_scenario("mini"),
-        CarParkDays("a $ in a name", 10.0, *[np.ones(3)] * 2, np.ones((2, 3))),
-    )
+    scenario, three = make_scenario("mini"), np.ones(3)
+    days = CarParkDays("a $ in a name", 10.0, three, three, np.ones((2, 3)))
     pictures = []
     for settings in ({"text.usetex": True, "savefig.facecolor": "red", "lines.linewidth": 9.0}, {}):
         with mpl.rc_context(settings):

@@ -61,9 +61,8 @@ PACKED = [("MCAP", "STORAGE"), ("MCAP", "MESSAGE"), ("SQLITE3", "MESSAGE"), ("RO
 
 @pytest.mark.parametrize(("plugin", "mode"), PACKED)
 def test_a_chunk_or_message_is_unpacked_up_to_a_limit(tmp_path, monkeypatch, plugin, mode):
-    path = (
-        bag_of_ros1(tmp_path / "one.bag", mode) if plugin == "ROS1" else bag(tmp_path / "bag", plugin, mode)
-    )
+    ros1 = plugin == "ROS1"
+    path = bag_of_ros1(tmp_path / "1.bag", mode) if ros1 else bag(tmp_path / "bag", plugin, mode)
     assert sizes(path) == [LARGE]
     monkeypatch.setattr(recordings, "MAX_PART_BYTES", LARGE - 1)
     with pytest.raises(InputError, match=r"bag: .* unpacks to more than 2,999,999 bytes"):
@@ -73,9 +72,7 @@ def test_a_chunk_or_message_is_unpacked_up_to_a_limit(tmp_path, monkeypatch, plu
 def test_a_packed_file_grows_a_hundredfold_at_most(tmp_path):
     assert sizes(bag(tmp_path / "small", "SQLITE3", "FILE", size=500_000)) == [500_000]
     path = bag(tmp_path / "bag", "SQLITE3", "FILE")
-    with pytest.raises(
-        InputError, match=r"bag\.db3\.zstd: has more than [\d,]+ bytes, the most that is read"
-    ):
+    with pytest.raises(InputError, match=r"bag\.db3\.zstd: has more than [\d,]+ bytes, the most"):
         sizes(path)
 
 

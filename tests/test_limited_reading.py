@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from parkenv.errors import InputError
-from parkenv.files.images import decode_image, read_image
+from parkenv.files.images import decode_image
 from parkenv.files.limited_reading import (
     MAX_MEMBERS,
     csv_records,
@@ -23,7 +23,6 @@ from parkenv.files.limited_reading import (
     read_arrays,
     read_bytes,
     read_json,
-    read_text,
     read_toml,
     read_yaml,
 )
@@ -206,13 +205,3 @@ def test_an_array_is_as_large_as_its_header_says(member):
 def test_an_image_is_measured_before_it_is_decoded(data, message):
     with pytest.raises(InputError, match=message):
         decode_image(data, "a.png")
-
-
-def test_an_image_is_read(tmp_path):
-    (tmp_path / "a.png").write_bytes(png(10, 5, bytes(55)))
-    assert read_image(tmp_path / "a.png").shape == (5, 10)
-
-
-def test_text_loses_its_byte_order_mark(tmp_path):
-    (tmp_path / "a").write_bytes(b"\xef\xbb\xbfabc")
-    assert read_text(tmp_path / "a") == "abc"

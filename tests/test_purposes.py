@@ -141,25 +141,6 @@ def test_a_scenario_file_has_purposes():
     assert make_scenario("mini").demand is None
 
 
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"arrivals_per_hour": [1.0] * 23}, "demand.shoppers.arrivals_per_hour"),
-        ({"arrivals": 3}, "unknown key 'arrivals'"),
-        ({"classes": {"permit-a": 1.5}}, "demand.shoppers.classes.permit-a"),
-        ({"stay_law": "weibull"}, "demand.shoppers.stay_law"),
-        ({"goals": [1.0, 2.0]}, "demand.shoppers.goals has 2 numbers, the lot has 1"),
-        ({"parked": -3}, "demand.shoppers.parked"),
-    ],
-)
-def test_bad_tables_are_named(changes, named):
-    tables = TABLES | {"demand": {"shoppers": {"arrivals_per_hour": 30} | changes}}
-    with pytest.raises(InputError, match=r"town\.toml") as error:
-        make_scenario(ScenarioSpec.parse(tables, "town.toml").of_file("town.toml"))
-    assert named in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 def test_drivers_pay_by_their_own_time_and_park_by_their_classes():
     lot = make_scenario("mini").lot
     zones = np.where(np.arange(10) < 5, "kerb", "residents")

@@ -173,11 +173,6 @@ def mini():
 LOTS = {make.__name__: make for make in (campus, jam, street, mini, town)}
 
 
-def build(folder):
-    """Write all packaged lots into a folder."""
-    for name, make in LOTS.items():
-        write_lot(make(), folder / f"{name}.geojson")
-
-
 if __name__ == "__main__":
-    build(Path(sys.argv[1]) if len(sys.argv) > 1 else PACKAGED)
+    for name, make in LOTS.items():
+        write_lot(make(), Path(sys.argv[1] if len(sys.argv) > 1 else PACKAGED) / f"{name}.geojson")

@@ -1,23 +1,16 @@
 """The packaged files are what the builders build."""
 
 import pytest
-from packaged import LOTS, PACKAGED, build
+from packaged import LOTS, PACKAGED
 
 from parkenv.files.known_names import PACKAGED_LOTS
-from parkenv.lots import packaged_lot
-from parkenv.lots.lot_files import check_lot
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("packaged")
-    build(folder)
-    return folder
+from parkenv.lots import check_lot, packaged_lot, write_lot
 
 
 @pytest.mark.parametrize("name", PACKAGED_LOTS)
-def test_packaged_lots_are_what_their_builders_build(name, built):
-    assert packaged_lot(name) == LOTS[name]()
-    committed = PACKAGED / f"{name}.geojson"
-    assert (built / committed.name).read_text() == committed.read_text()
+def test_packaged_lots_are_what_their_builders_build(name, tmp_path):
+    built, committed = LOTS[name](), PACKAGED / f"{name}.geojson"
+    write_lot(built, tmp_path / "built.geojson")
+    assert packaged_lot(name) == built
+    assert (tmp_path / "built.geojson").read_text() == committed.read_text()
     assert check_lot(committed) == []
