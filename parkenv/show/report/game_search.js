@@ -108,7 +108,8 @@ class GameSearch {
   /** Take an action of Search-v2: 0 to 3 drive up, down, left, right, or wait where there is no edge; 4 parks. */
   step(action) {
     const { problem, vertex } = this;
-    const step = { drive_s: problem.seconds[5 * vertex + action], failed_s: 0, walk_s: 0, parking_cost_s: 0, gave_up_s: 0 };
+    const step = Object.fromEntries(Object.keys(this.costs).map((field) => [field, 0]));
+    step.drive_s = problem.seconds[5 * vertex + action];
     const target = this.target(action);
     if (target >= 0) this.vertex = target;
     else if (action === PARK && vertex < this.n) {
