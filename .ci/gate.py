@@ -98,7 +98,7 @@ STAGES = (
         oldest=("$SCRATCH/oldest/bin/pytest" -p no:cacheprovider -W ignore::DeprecationWarning)
         "${oldest[@]}" --collect-only -qq
         "${oldest[@]}" -n auto \\
-            "tests/test_resumed_trainings.py::test_a_resumed_training_equals_an_unbroken_one[maskable-ppo]" \\
+            "tests/test_training.py::test_a_stopped_training_goes_on_from_its_checkpoint[maskable-ppo]" \\
             "tests/test_search_env.py::test_every_id_passes_the_checker_without_a_warning[mini-parkenv/Search-v2]" \\
             tests/test_compare.py::test_figures_and_occupancy_levels \\
             tests/test_{compilation,lot_files,hog,lot}.py \\

@@ -355,7 +355,7 @@ def test_every_algorithm_has_a_recipe():
     assert SEARCH_CONFIGS.keys() == ALGORITHMS.keys()
 
 
-# One on-policy algorithm and one with a replay buffer; `test_resumed_trainings` stops each kind.
+# One on-policy algorithm and one with a replay buffer; `TRAININGS` stops each kind.
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["maskable-ppo", "dqn"])
 def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch, algorithm):
