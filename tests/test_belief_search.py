@@ -219,10 +219,12 @@ def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than
     scenario, kept = at_occupancy(make_scenario("campus"), 0.95), []
     for seed in (5, 11, 17, 23, 29):
         made = choices(scenario, monkeypatch, seed=seed, budget_ms=10.0)
-        kept += [(remaining_s, choice.path.onward_s) for remaining_s, choice in made if remaining_s < np.inf]
-        last = [choice.path.remaining_s for _, choice in made]
+        kept += [
+            (remaining_s, choice.value.expected_s) for remaining_s, choice in made if remaining_s < np.inf
+        ]
+        last = [choice.value.remaining_s for _, choice in made]
         assert all(
             remaining_s in (last_s, np.inf) for (remaining_s, _), last_s in zip(made[1:], last, strict=False)
         )
     assert len(kept) > 10
-    assert all(onward_s <= remaining_s for remaining_s, onward_s in kept)
+    assert all(expected_s <= remaining_s for remaining_s, expected_s in kept)

@@ -376,7 +376,7 @@ def test_a_lot_file_is_driven_in_if_it_says_how_wide_its_slots_are(tmp_path):
     whole = dict(slot["properties"])
     del slot["properties"]["width"]
     path.write_text(json.dumps(document))
-    with pytest.raises(InputError, match="no width, want all of"):
+    with pytest.raises(InputError, match="width is missing"):
         make(path)
     slot["properties"] = whole
     slot["geometry"] = {"type": "Point", "coordinates": [1.0, 1.0]}

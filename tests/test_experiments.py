@@ -136,7 +136,7 @@ def test_agents_with_options_are_read_from_words_and_tables():
         ("grid = { failure_s = [1, 1] }", "grid.failure_s is [1, 1], want different values; 1.0 is repeated"),
         ("kind = 'comparison'", "kind is 'comparison'; did you mean 'compare'?"),
         ("kind = { a = 1 }", "kind is {'a': 1}; "),
-        ("backend = 'spark'", "backend is 'spark', want 'loky' or 'dask'"),
+        ("backend = 'spark'", "backend is 'spark', want 'loky', 'ray' or 'dask'"),
     ],
 )  # fmt: skip
 def test_bad_files_are_refused_in_one_line(tmp_path, text, message):

@@ -93,7 +93,7 @@ def resumed(path):
 
 def reported(path):
     run = RunFolder.read(path.parent)
-    write_page(run.data(), path.with_name("report.html"), run.figures)
+    write_page(run.data(), path.with_name("report.html"))
 
 
 def reported_kind(path):

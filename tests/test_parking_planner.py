@@ -227,7 +227,7 @@ def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
         lambda vehicle: ParkingAgent(vehicle, search=NO_ROOM),
     )
     out = tmp_path / "park"
-    done = ran("park --seed 3 --lot mini --way back-in --episodes 2 --slack 0 --jobs 1 --out", out)
+    done = ran("park --seed 3 --lot mini --way back-in --episodes 2 --jobs 1 --out", out)
     assert "failed: mini, seed 3" in done.stdout
     assert "no path was found" in done.stdout
     assert (out / "failures.png").exists()

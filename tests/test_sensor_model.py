@@ -142,5 +142,5 @@ def mean_total_s(name, agent, rig):
 
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_agents_that_plan_on_what_they_see_refuse_to_search_blindly(name):
-    with pytest.raises(InputError, match="plans on observations from the lane"):
+    with pytest.raises(InputError, match="plans on observations, and this sensor model has none"):
         make_agent(name, make_scenario("mini", sensor_model=SensorModel.blind()))

@@ -29,7 +29,7 @@ from parkenv.studies.workers import Workers
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 
-GONE_S = 5.0
+GONE_S = 30.0
 """Time until no process of a stopped run is left."""
 
 

@@ -231,7 +231,7 @@ def encoded(mark):
         (written(with_header(b"{" * 300_000)), "header: "),
         (written(with_header({"__metadata__": {}})), "it has no card"),
         (written(with_header({"__metadata__": {"parkenv": "[]"}})), "card is a list, want a JSON"),
-        (pickled, "pickled objects, which run code .* save_model"),
+        (pickled, "pickled objects, which run code"),
         (lambda path, mark: path.write_bytes(pickle.dumps(Payload(mark))), "no model file"),
         (changed_card(policy_options={"net_arch": [10**9]}), "net_arch"),
         (changed_card(policy_options={"net_arch": [64]}), "its network cannot be read"),

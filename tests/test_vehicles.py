@@ -79,7 +79,7 @@ def test_bodies_and_paints_are_as_common_as_stated():
     assert all(sum(c.share for c in group) == pytest.approx(1.0) for group in SIZE_CLASSES.values())
 
 
-EVERY_MESH = pytest.mark.parametrize(("body", "level"), product(BODIES, (DETAILED, COARSE)))
+EVERY_MESH = pytest.mark.parametrize(("body", "level"), list(product(BODIES, (DETAILED, COARSE))))
 
 
 @EVERY_MESH
