@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -110,7 +111,7 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[Row]:
     known, _ = label_setting.by_policy_iteration(mdp)
     seen = mdp.p_free.copy()
     seen[: lot.n_slots // 20] = 0.0
-    after = label_setting.with_p_free(mdp, seen)
+    after = dataclasses.replace(mdp, p_free=seen)
     warm = 1e6 * seconds_each(lambda _: label_setting.by_policy_iteration(after, known), seconds)
     peers = {"plan from scratch": fresh, "policy iteration from the last plan": warm}
     case = f"after an observation; {lot.name}, {lot.n_vertices} vertices"
