@@ -113,16 +113,14 @@ def begin_search_at(address: int) -> None:
     search = search_at(address, 0)
     arrive(search)
     write_clock(search)
-    if search.belief != 0 and scenario_at(search.scenario, 0).prior_kind != EXTERNAL_KIND:
+    if scenario_at(search.scenario, 0).prior_kind != EXTERNAL_KIND:
         init_full_prior(search)
 
 
 @kernel
 def init_full_prior_at(address: int) -> None:
     """Initialise the belief with the forecast in `Searches.external_forecast`."""
-    search = search_at(address, 0)
-    if search.belief != 0:
-        init_full_prior(search)
+    init_full_prior(search_at(address, 0))
 
 
 @kernel
@@ -579,8 +577,7 @@ def publish_count(counted: Any, time: float) -> None:
 @inlined
 def init_prior(search: Any) -> None:
     """Initialise the full belief, if it is kept, with the forecast of every slot; take in live counts."""
-    if search.belief != 0:
-        init_full_prior(search)
+    init_full_prior(search)
     if scenario_at(search.scenario, 0).n_live > 0:
         observe_live(search)
         refresh_belief(search)

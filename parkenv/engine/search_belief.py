@@ -236,7 +236,9 @@ def forecast_of(search: Any, slot: int) -> tuple[float, float]:
 
 @kernel
 def init_full_prior(search: Any) -> None:
-    """Write the forecast of every slot as the belief, (4, width), as if nothing had been observed."""
+    """Write the forecast of every slot as the full belief, (4, width), if it is kept: nothing is observed yet."""
+    if search.belief == 0:
+        return
     scenario, width = scenario_at(search.scenario, 0), search.width
     belief, p_occupied, n = float32s(search.belief), float32s(search.p_occupied), scenario.n_slots
     if scenario.prior_kind == PROCESS_KIND:
