@@ -44,6 +44,13 @@ _LOT_COLUMNS = (
     Column("result", "result"),
     Column("reason", "reason"),
 )
+_UNREAD_COLUMNS = (
+    Column("tag", "tag"),
+    Column("value", "value"),
+    Column("count", "how often", digits=0),
+    Column("assumed", "assumed"),
+)
+_MOST_UNREAD = 40  # most rows of what could not be read that are printed
 AUTO = "auto"  # value of `--entry` and `--goal` that allows a guess
 LotName = Annotated[
     str,
@@ -281,7 +288,7 @@ class Import(Command):
         from parkenv.lots.town.supply import TABLE
 
         check_lot_output(self.out)
-        table, town = self.out.with_suffix(".csv"), None
+        table, unread_csv, town = self.out.with_suffix(".csv"), self.out.with_suffix(".unread.csv"), None
         require(
             self.picture is None or self.picture.suffix.lower() == ".png",
             f"--picture {self.picture}: want a name that ends in .png",
@@ -319,6 +326,11 @@ class Import(Command):
         if town is not None:
             write_csv(table, TABLE, town.facilities)
             console.print(f"Facilities: {table}")
+        if draft.unread or unread_csv.exists():
+            rows = [vars(row) for row in draft.unread]
+            write_csv(unread_csv, [column.key for column in _UNREAD_COLUMNS], rows)
+            print_rows(console, "Tags that could not be read", rows[:_MOST_UNREAD], columns=_UNREAD_COLUMNS)
+            console.print(f"Tags that could not be read: {len(rows)}, all in {unread_csv}")
         console.print(f"Wrote {self.out}. {_summary(lot)}")
         if caution:
             console.print(caution, style="yellow")

@@ -15,6 +15,7 @@ from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.unread import Unread
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.facility import Facility
 from parkenv.world.lot import Lane, Mouth, ParkingLot, Turn
@@ -149,6 +150,7 @@ class LotDraft:
     guesses: tuple[str, ...] = ()  # one sentence per thing that the file does not say
     issues: tuple[QualityIssue, ...] = ()  # what may be wrong with the result
     left_out: tuple[LeftOut, ...] = ()  # elements that were not used
+    unread: tuple[Unread, ...] = ()  # values of tags that could not be read
     missing: tuple[str, ...] = ()  # one sentence per missing part that a search needs, with how to provide it
     frame: LocalFrame | None = None  # geographic frame of the lot; None if the file has none
     facilities: tuple[Facility, ...] = ()  # counted ones need no slot here

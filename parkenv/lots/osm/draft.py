@@ -79,6 +79,7 @@ from parkenv.lots.osm.roads import (
     used_roads,
     whole_number,
 )
+from parkenv.lots.unread import unread_table
 from parkenv.world.drive_graph import SLOT_REACH, component_labels
 from parkenv.world.lot import Lane
 
@@ -96,11 +97,12 @@ MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
 
 def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     path = Path(path)
-    place = read_map(path)
-    with naming(path):
-        draft = draft_of_map(place_name(path), place, options or ImportOptions(), place.positions.frame)
+    with unread_table() as unread:
+        place = read_map(path)
+        with naming(path):
+            draft = draft_of_map(place_name(path), place, options or ImportOptions(), place.positions.frame)
     found = (*filter(None, [place.positions.found]), *draft.found, *place.cut_elements())
-    return replace(draft, found=found, left_out=(*place.left_out, *draft.left_out))
+    return replace(draft, found=found, left_out=(*place.left_out, *draft.left_out), unread=unread.rows)
 
 
 def draft_of_map(

@@ -69,6 +69,7 @@ from parkenv.lots.town.supply import (
     strip_side,
     table_of,
 )
+from parkenv.lots.unread import unread_table
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_REACH
 from parkenv.world.lot import Lane
@@ -128,8 +129,8 @@ def import_town(
     """
     path = Path(path)
     listed = [] if car_parks is None else read_listed(Path(car_parks))
-    place = read_map(path)
-    with naming(path):
+    with unread_table() as unread, naming(path):
+        place = read_map(path)
         town = _TownImport(place_name(path), place if bounds is None else place.within(bounds))
         town.read_drawn()
         town.read_kerbs(untagged_kerbs)
@@ -139,7 +140,8 @@ def import_town(
         if listed_only:
             town.rows = [row for row in town.rows if row.capacity_from == "list"]
             town.beside = np.array([row.xy for row in town.rows]).reshape(-1, 2)
-        return town.draft()
+        whole = town.draft()
+    return replace(whole, draft=replace(whole.draft, unread=unread.rows))
 
 
 class _TownImport(MapImport):
