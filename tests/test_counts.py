@@ -1,6 +1,7 @@
 """Counts of car parks: their faults, each cleaned and counted."""
 
-from datetime import date, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta, timezone
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
@@ -115,6 +116,47 @@ def test_summer_time_and_duplicates(tmp_path):
     assert (counts.faults[0]["summer_time"], counts.faults[0]["duplicate"]) == (2, 1)
     utc = read(tmp_path, rows, "car_park,capacity,hour_utc,free", timezone="UTC")
     assert utc.faults[0]["summer_time"] == 0
+
+
+@pytest.mark.parametrize(
+    ("zone", "back", "twice"),
+    [
+        ("Europe/Berlin", date(2023, 10, 29), 2),
+        ("America/Asuncion", date(2023, 3, 25), 23),  # from midnight back to 23:00
+        ("Africa/Cairo", date(2023, 10, 26), 23),
+        ("America/Havana", date(2023, 11, 5), 0),
+    ],
+)
+def test_an_hour_that_comes_twice_is_found_at_midnight_too(tmp_path, zone, back, twice):
+    start = datetime(back.year, back.month, back.day) - timedelta(days=1)
+    hours = [start + timedelta(hours=h) for h in range(80)]
+    rows = [f"a,100,{hour:%Y-%m-%dT%H:%M}Z,{i}" for i, hour in enumerate(hours)]
+    counts = read(tmp_path, rows, "car_park,capacity,hour_utc,free", timezone=zone)
+    local = [hour.replace(tzinfo=UTC).astimezone(ZoneInfo(zone)) for hour in hours]
+    both = [i for i, hour in enumerate(local) if (hour.date(), hour.hour) == (back, twice)]
+    assert len(both) == 2
+    assert counts.occupied[0, counts.day_index(back), twice] == pytest.approx(1 - np.mean(both) / 100)
+    assert (counts.faults[0]["summer_time"], counts.faults[0]["duplicate"]) == (1, 0)
+
+
+@pytest.mark.parametrize("order", ["newest first", "shuffled"])
+def test_the_last_reading_of_an_hour_counts_in_any_order(tmp_path, order):
+    """With offsets, which order texts otherwise than times, and a reading repeated at the same time."""
+    zones = [timezone(timedelta(hours=h)) for h in (-5, 0, 9)]
+    start = datetime(2024, 3, 30, tzinfo=UTC)
+    moments = [start + timedelta(minutes=10 * i) for i in range(6 * 72)]
+    rows = [f"a,100,{m.astimezone(zones[i % 3]).isoformat()},{5 + i % 90}" for i, m in enumerate(moments)]
+    rows.append(rows[-1].rsplit(",", 1)[0] + ",7")
+    wanted = read(tmp_path, rows)
+    changed = (
+        rows[::-1]
+        if order == "newest first"
+        else [*np.random.default_rng(0).permutation(rows[:-2]), *rows[-2:]]
+    )
+    counts = read(tmp_path, changed)
+    np.testing.assert_array_equal(counts.occupied, wanted.occupied)
+    assert counts.faults == wanted.faults
+    assert wanted.occupied[0, 0, 1] == pytest.approx(1 - (5 + 5) / 100)  # 00:50 UTC
 
 
 def test_moments_on_the_hour_hold_for_the_end_of_the_hour_before(tmp_path):

@@ -198,9 +198,15 @@ def test_levels_are_drawn_for_a_car_in_a_file_and_a_run_says_it_again(tmp_path):
 
 CROSSED = [[0.0, 5.0], [2.0, 7.0], [2.0, 5.0], [0.0, 7.0]]
 BAD = {
-    "crossing.csv": (tpcap_text(START, TARGET, [CROSSED]), "no simple polygon"),
-    "inside.csv": (tpcap_text(START, TARGET, [[[0, -1], [3, -1], [3, 1], [0, 1]]]), "target is"),
-    "touching.csv": (tpcap_text(START, TARGET, [[[0, 2], [3, 2], [3, 4], [0, 4]]]), "start is"),
+    "crossing.csv": (tpcap_text(START, TARGET, [CROSSED]), "no simple polygon: Self-intersection[1 6]"),
+    "inside.csv": (
+        tpcap_text(START, TARGET, [[[0, -1], [3, -1], [3, 1], [0, 1]]]),
+        f"target is [{TARGET[0]}, 0.0, 0.0]: the car",
+    ),
+    "touching.csv": (
+        tpcap_text(START, TARGET, [[[0, 2], [3, 2], [3, 4], [0, 4]]]),
+        "start is [1.0, 3.0, 0.0]: the car",
+    ),
     "nan.csv": (tpcap_text((math.nan, 0.0, 0.0), TARGET, BLOCKS), "not finite"),
     "short.csv": ("0,0,0,9,0,0,2,4,4,1,1", "want start and target"),
     "many.csv": ("0,0,0,9,0,0,1,1000000," + "1.0," * 2_000_000, "want at most"),
@@ -211,6 +217,18 @@ BAD = {
     "short.toml": (own_text(start=[0.0, 1.0]), "start"),
     "car.toml": (own_text(vehicle="tank"), "vehicle is 'tank'"),
     "truck.toml": (own_text(vehicle=0).replace("vehicle = 0", "vehicle = {lenght = 5.0}"), "'lenght'"),
+    "degrees.toml": (
+        own_text(target=[1.4, 0.0, 90.0]),
+        "target is [1.4, 0.0, 90.0]: its yaw is beyond ±2π, want radians",
+    ),
+    "degrees.csv": (tpcap_text((1.0, 3.0, -180.0), TARGET, BLOCKS), "-180° are -3.1416 rad"),
+    "outside.toml": (
+        own_text(bounds=[50.0, 0.0, 60.0, 9.0]),
+        "start is [1.0, 3.0, 0.0]: the car reaches beyond",
+    ),
+    "turned.toml": (own_text(bounds=[9.0, 9.0, -9.0, -9.0]), "want smallest x and y, then largest"),
+    "far.toml": (own_text(target=[1e7, 0.0, 0.0]), "want a manoeuvre of 500 m at most"),
+    "features.json": ('{"features": 3}', "features is 3, want a list"),
     "hole.geojson": ('{"features": [{"geometry": {"type": "Point", "coordinates": [1, 2]}}]}', "features.0"),
     "empty": (None, "is not there"),
 }
@@ -238,6 +256,24 @@ def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
 def test_options_that_do_not_fit_are_refused(options, wanted, tmp_path):
     assert wanted in refused(f"park {options} --out out", cwd=tmp_path)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("target", "obstacles", "length", "clearance"),
+    [
+        ([1.0, 3.0, 0.0], [{"line": [[-5.0, -2.0], [9.0, -2.0]]}], 0.0, pytest.approx(4.1, abs=0.01)),
+        ([1.0, 3.0, 0.0], [], 0.0, None),
+        ([1.03, 3.0, 2 * math.pi - 0.005], [], 0.0, None),
+        ([4.0, 3.0, 0.0], [], pytest.approx(3.0, abs=0.05), None),
+    ],
+)
+def test_a_car_at_its_target_stays_and_a_scene_may_be_empty(target, obstacles, length, clearance, tmp_path):
+    scene = {"start": [1.0, 3.0, 0.0], "target": target, "obstacles": obstacles}
+    (tmp_path / "a.json").write_text(json.dumps(scene))
+    ran("park --cases a.json --out out", cwd=tmp_path)
+    (row,) = summary_of(tmp_path / "out")["rows"]
+    assert (row["planned"], row["driven"], row["contact"]) == (True, True, False)
+    assert (row["length_m"], row["clearance_m"]) == (length, clearance)
 
 
 @pytest.mark.slow

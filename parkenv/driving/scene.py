@@ -19,6 +19,7 @@ from parkenv.driving.road_users import Crossing
 from parkenv.driving.vehicle import VehicleParameters, finite_pose
 from parkenv.errors import InputError
 
+MAX_DISTANCE_M = 500.0  # greatest distance from start to target, m
 MAX_POINTS = 20_000  # greatest number of points of all obstacles of a scene
 CHECK_M = 0.02  # greatest distance that any point of the car moves between two checked footprints, m
 POSITION_TOLERANCE_M, ANGLE_TOLERANCE_RAD = 0.05, 0.01
@@ -69,12 +70,30 @@ class Scene:
                 )
         for i, shape in enumerate(self.shapes):
             if not shape.is_valid:
-                raise InputError(f"obstacle {i} is no simple polygon: {shapely.is_valid_reason(shape)}")
-        for name in ("start", "target"):
-            if self.check(getattr(self, name)[None]).contact:
-                raise InputError(
-                    f"{name} is {getattr(self, name).tolist()}: the car touches an obstacle there"
+                reason = shapely.is_valid_reason(
+                    shapely.transform(shape, lambda points: points + self.origin)
                 )
+                raise InputError(f"obstacle {i} is no simple polygon: {reason}")
+        for name in ("start", "target"):
+            self._require_free(name, getattr(self, name))
+        if (apart := math.dist(self.start[:2], self.target[:2])) > MAX_DISTANCE_M:
+            raise InputError(
+                f"target is {apart:,.0f} m from start, want a manoeuvre of {MAX_DISTANCE_M:g} m at most"
+            )
+
+    def _require_free(self, name: str, pose: FloatArray) -> None:
+        """Check a pose; messages have the coordinates of the file."""
+        where = f"{name} is {[*(pose[:2] + self.origin).tolist(), float(pose[2])]}"
+        if abs(pose[2]) > 2.0 * math.pi + 0.02:
+            raise InputError(
+                f"{where}: its yaw is beyond ±2π, want radians; {pose[2]:g}° are {math.radians(pose[2]):.4f} rad"
+            )
+        if self.bounds is not None and not shapely.box(*self.bounds).covers(
+            shapely.Polygon(self.vehicle.corners(pose))
+        ):
+            raise InputError(f"{where}: the car reaches beyond the bounds there")
+        if self.check(pose[None]).contact:
+            raise InputError(f"{where}: the car touches an obstacle there")
 
     @cached_property
     def shapes(self) -> list[BaseGeometry]:

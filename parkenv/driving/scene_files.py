@@ -190,6 +190,8 @@ def _parkbench(content: Mapping[str, Any], name: str, vehicle: VehicleParameters
 
 def _own(content: Mapping[str, Any], path: Path, vehicle: VehicleParameters | None) -> Scene:
     spec = SceneSpec.parse(content, "", path.parent)
+    if spec.bounds and not (spec.bounds[0] < spec.bounds[2] and spec.bounds[1] < spec.bounds[3]):
+        raise InputError(f"bounds is {list(spec.bounds)}, want smallest x and y, then largest x and y")
     contours = []
     for i, each in enumerate(spec.obstacles):
         if (each.polygon is None) == (each.line is None):
@@ -200,8 +202,9 @@ def _own(content: Mapping[str, Any], path: Path, vehicle: VehicleParameters | No
     scene = _scene(path.stem, vehicle or given, spec.start, spec.target, contours, spec.bounds)
     crossings = []
     for user in spec.crossings:
+        crossing = Crossing(user.kind, user.way, user.speed_mps, user.begins_s)  # checked as in the file
         start, end = (tuple((np.array(point) - scene.origin).tolist()) for point in user.way)
-        crossings.append(Crossing(user.kind, (start, end), user.speed_mps, user.begins_s))
+        crossings.append(dataclasses.replace(crossing, way=(start, end)))
     return dataclasses.replace(scene, crossings=tuple(crossings))
 
 
@@ -209,6 +212,8 @@ def _of_geojson(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables of a GeoJSON file: points of the kinds start and target with a yaw; polygons and lines."""
     tables: dict[str, Any] = {name: content[name] for name in ("vehicle", "bounds") if name in content}
     obstacles: list[dict[str, Any]] = []
+    if not isinstance(content["features"], list):
+        raise InputError(f"features is {content['features']!r:.60}, want a list")
     for i, feature in enumerate(content["features"]):
         try:
             kind = (feature.get("properties") or {}).get("kind", "obstacle")

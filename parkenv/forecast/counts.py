@@ -13,7 +13,7 @@ rule:
 - `capacity_changed`: the stated capacity changes from one day to the next; occupancy refers to the day's own.
 - `capacity_estimated`: days of a car park where in the 28 days before more than 5 % of the readings exceed the stated
   capacity. The 98 % quantile of those readings then serves as the capacity.
-- `duplicate`: several readings of one hour; the last counts. In the hour that comes twice, their mean.
+- `duplicate`: several readings of one hour; the last in time counts. In the hour that comes twice, their mean.
 - `summer_time`: days of 23 or 25 hours. `gap`: hours without a reading between a car park's first and last day.
 
 Every rule looks back only: what is known of a day does not depend on later days. The exception are the hours of a run
@@ -147,9 +147,9 @@ def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
         raise InputError(f"{path}: want the columns {wanted}") from None
     utc, before = time.endswith("_utc"), _AN_INSTANT if time.startswith("time") else timedelta(0)
     names: dict[str, int] = {}
-    times: dict[str, tuple[int, int]] = {}
+    times: dict[str, tuple[int, int, float]] = {}
     numbers: dict[str, float] = {}
-    table: list[tuple[int, int, int, float, float]] = []
+    table: list[tuple[int, int, int, float, float, float]] = []
     for line, row in rows:
         name, capacity, moment, free = (row[i] for i in columns)
         if name not in names and not (0 < len(name) <= MAX_NAME and name.isprintable()):
@@ -168,6 +168,9 @@ def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
     if not table:
         raise InputError(f"{path}: has no readings, want at least one")
     values = np.array(table, float)
+    newest_first = values[0, 3] > values[-1, 3]
+    values = values[::-1] if newest_first else values
+    values = values[np.argsort(values[:, 3], kind="stable")]
     rank = np.unique(list(names), return_inverse=True)[1]
     days = values[:, 1].astype(np.int64)
     n_days = int(days.max() - days.min()) + 1
@@ -182,17 +185,18 @@ def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
         rank[values[:, 0].astype(np.int64)],
         days - days.min(),
         values[:, 2].astype(np.int64),
-        values[:, 3],
         values[:, 4],
+        values[:, 5],
     )
 
 
-def _local_hour(text: str, zone: ZoneInfo, utc: bool, before: timedelta) -> tuple[int, int]:
-    """Return the day (proleptic Gregorian ordinal) and the hour of the time `before` a given one."""
+def _local_hour(text: str, zone: ZoneInfo, utc: bool, before: timedelta) -> tuple[int, int, float]:
+    """Return the day (proleptic Gregorian ordinal), the hour and the Unix time of the time `before` a given one."""
     moment = datetime.fromisoformat(text) - before
-    if utc or moment.tzinfo is not None:
-        moment = (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).astimezone(zone)
-    return moment.toordinal(), moment.hour
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC if utc else zone)
+    moment = moment if moment.tzinfo is zone else moment.astimezone(zone)
+    return moment.toordinal(), moment.hour, moment.timestamp()
 
 
 def _cleaned(readings: _Readings, zone: ZoneInfo, source: str) -> Counts:
@@ -234,14 +238,15 @@ def _summer_time(days: tuple[date, ...], zone: ZoneInfo) -> dict[int, int]:
     changes = {}
     for i, start in enumerate(midnights):
         hours = [start.replace(hour=hour) for hour in range(HOURS)]
-        if hours[0].utcoffset() != hours[-1].utcoffset():
+        # The last hour's second fold: where the clock goes from midnight back to 23:00, the day ends with it.
+        if hours[0].utcoffset() != hours[-1].replace(fold=1).utcoffset():
             # The hour that the spring leaves out differs by fold as well, but is changed on the way through UTC.
             changes[i] = next(
                 (
                     t.hour
                     for t in hours
                     if t.utcoffset() != t.replace(fold=1).utcoffset()
-                    and t.astimezone(UTC).astimezone(zone).hour == t.hour
+                    and t.astimezone(UTC).astimezone(zone) == t
                 ),
                 -1,
             )

@@ -103,11 +103,15 @@ class Judgement(NamedTuple):
 
 
 def park(scene: Scene) -> Manoeuvre:
-    """Plan a path from a scene's start to its target, and drive it.
+    """Plan a path from a scene's start to its target, and drive it; one that starts at its target stays there.
 
     The car is driven fluently; where that would touch something or end too far from the target, it is driven anew
     and stops to turn its wheels, or on another path. The planner knows the vehicle's model, so it finds that out first.
     """
+    start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])[None]
+    there = Manoeuvre(scene, CarPath(scene.start, np.zeros(0), np.zeros(0)), start, 0.0)
+    if there.judged.driven:
+        return there
     paths, planning_s, tried = paths_in_scene(scene), 0.0, list[Manoeuvre]()
     while not any(manoeuvre.judged.driven for manoeuvre in tried):
         began = time.perf_counter()
@@ -122,8 +126,7 @@ def park(scene: Scene) -> Manoeuvre:
                 return manoeuvre
             tried.append(manoeuvre)
     if not tried:
-        start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
-        return Manoeuvre(scene, None, start[None], planning_s)
+        return Manoeuvre(scene, None, start, planning_s)
     return max(tried, key=lambda manoeuvre: manoeuvre.judged.score)
 
 

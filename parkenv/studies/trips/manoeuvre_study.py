@@ -209,7 +209,8 @@ class ManoeuvreStudy(Study):
         if row["driven"]:
             n = row["direction_changes"]
             times = f"{row['time_s']:.1f} s, {n} change{'' if n == 1 else 's'}"
-            return f"{times}, {100 * row['clearance_m']:.0f} cm clear"
+            clear = row["clearance_m"]
+            return times if clear is None or np.isnan(clear) else f"{times}, {100 * clear:.0f} cm clear"
         return "no path" if not row["planned"] else "contact" if row["contact"] else "not at the target"
 
 
@@ -217,6 +218,9 @@ def manoeuvre_row(keys: Row, manoeuvre: Manoeuvre) -> Row:
     """Return the row of a manoeuvre, with those of its trajectory and of road users, in the frame of its file."""
     from parkenv.driving.vehicle import PHYSICS_S
 
+    judged = manoeuvre.judged._asdict()
+    if np.isinf(judged["clearance_m"]):  # there is no obstacle
+        judged["clearance_m"] = np.nan
     lines = manoeuvre.states[:, : len(_STATE)].round(7)
     lines[:, :2] += manoeuvre.scene.origin
     time, others = [round(PHYSICS_S * i, 2) for i in range(len(lines))], dict[str, Row]()
@@ -229,7 +233,7 @@ def manoeuvre_row(keys: Row, manoeuvre: Manoeuvre) -> Row:
     return {
         **keys,
         "planned": manoeuvre.path is not None,
-        **manoeuvre.judged._asdict(),
+        **judged,
         "time_s": manoeuvre.time_s,
         "length_m": manoeuvre.length_m,
         "direction_changes": manoeuvre.direction_changes,
