@@ -18,7 +18,7 @@ class InputError(ValueError):
 
 
 def needs_extra(what: str, extra: str) -> str:
-    return f"{what} needs the extra {extra}: pip install 'parkenv[{extra}]'"
+    return f'{what} needs the extra {extra}: pip install "parkenv[{extra}]"'
 
 
 @contextmanager

@@ -6,6 +6,8 @@ import json
 import numpy as np
 import pytest
 from command_line import ran, refused
+from made_maps import Map
+from scipy.spatial import cKDTree
 from small_lots import CAR_PARKS
 
 from parkenv import InputError, make_scenario
@@ -13,6 +15,7 @@ from parkenv.driving.driven_lines import DrivenLines
 from parkenv.engine.sensor_sampler import make_rig
 from parkenv.lots import packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import LotDraft
+from parkenv.lots.town.draft import import_town
 from parkenv.world.lot import MOVES, Lane, Mouth, Turn
 
 ACROSS = np.array([-1.0, 1.0])
@@ -78,3 +81,34 @@ def test_the_command_imports_it(tmp_path):
     assert "--left-hand" in refused("lot", "import", "x.osm", "--split", "--left-hand", "--out", tmp_path)
     ran("lot", "import", str(tmp_path / "mini.geojson"), "--left-hand", "--out", str(tmp_path / "l.geojson"))
     assert read_lot(tmp_path / "l.geojson").left_hand
+
+
+@pytest.mark.parametrize("tags", [{}, {"parking:both": "lane", "parking:both:orientation": "diagonal"}])
+def test_a_mirrored_town_is_its_mirror_image(tmp_path, tags):
+    """A dual carriageway, whose untagged kerbs are the outer ones, a one-way and a two-way street."""
+    towns = []
+    for sign in (1, -1):
+        place = Map()
+        for x, y, kind in ((-10, 1, "tertiary"), (10, -1, "tertiary"), (60, 1, "residential")):
+            ends = [(sign * -x, -y * 200), (sign * -x, 0), (sign * -x, y * 200)]
+            place.way(ends, {"highway": kind, "oneway": "yes", **tags})
+        place.way(
+            [(sign * 100, -200), (sign * 100, 0), (sign * 100, 200)], {"highway": "residential", **tags}
+        )
+        for y in (-200, 0, 200):
+            place.way(
+                [(sign * x, y) for x in (-60, -10, 10, 100)], {"highway": "residential", "parking:both": "no"}
+            )
+        place.way([(sign * 100, 0), (sign * 200, 0)], {"highway": "primary", "parking:both": "no"})
+        for x in (-75, -25, 20, 85, 115):
+            place.box(sign * x, -190, sign * (x + 5), 190, {"building": "house"})
+        path = place.write(tmp_path / f"{sign}.osm")
+        town = import_town(path, left_hand=sign < 0).draft
+        towns.append((town.in_left_hand_traffic() if sign < 0 else town).lot())
+    right, left = towns
+    assert left.n_slots == right.n_slots > 30
+    apart, other = cKDTree(left.slot_xy).query(right.slot_xy * ACROSS)
+    assert apart.max() < 0.05
+    np.testing.assert_allclose(np.cos(left.slot_yaw[other] + right.slot_yaw - np.pi), 1.0, atol=1e-3)
+    if not tags:  # no car on the median: the halves are at -10 m and 10 m, the middle of all streets at 70 m
+        assert not (np.abs(left.slot_xy[:, 0] - 70.0) < 10.0).any()

@@ -280,7 +280,7 @@ class TestExtracts:
     def test_without_osmium_a_line_says_what_to_install(self, monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, "osmium", None)
         said = refused("lot import town.osm.pbf --split --out lots", cwd=tmp_path)
-        assert "pip install 'parkenv[osm]'" in said
+        assert 'pip install "parkenv[osm]"' in said
 
 
 class TestSurvey:

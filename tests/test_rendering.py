@@ -175,7 +175,7 @@ def test_a_window_shows_frames_and_without_pygame_says_what_to_install(monkeypat
     window.close()
     assert not pygame.display.get_init()
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(gym.error.DependencyNotInstalled, match=r"pip install 'parkenv\[human\]'"):
+    with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip install "parkenv\[human\]"'):
         check_env(gym.make("parkenv/Search-v2", scenario="mini").unwrapped)
 
 

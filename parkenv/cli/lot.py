@@ -274,6 +274,7 @@ class Import(Command):
             guess_entry=self.split or AUTO in self.entry,
             guess_goal=self.split or AUTO in self.goal,
             bounds=self.box,
+            left_hand=self.left_hand,
         )
 
     def run(self) -> None:
@@ -300,7 +301,7 @@ class Import(Command):
         if self.town:
             town = import_town(
                 self.place, self.car_parks, listed_only=self.listed_only, bounds=self.box,
-                untagged_kerbs=self.untagged_kerbs,
+                untagged_kerbs=self.untagged_kerbs, left_hand=self.left_hand,
             )  # fmt: skip
         draft = town.draft if town is not None else import_lot(self.place, self._options)
         draft = draft.in_left_hand_traffic() if self.left_hand else draft

@@ -91,6 +91,7 @@ class ImportOptions:
     bounds: tuple[tuple[float, float], tuple[float, float]] | None = None
     guess_entry: bool = False  # whether an entry that the file does not show may be guessed
     guess_goal: bool = False  # the same for goals
+    left_hand: bool = False  # whether cars keep to the left
 
     def __post_init__(self) -> None:
         for what, points in (("goal", self.goals), ("entry", self.entries), ("bounds", self.bounds or ())):

@@ -74,6 +74,7 @@ from parkenv.lots.osm.roads import (
     read_roads,
     road_ends,
     road_of,
+    stops_cars,
     street_junctions,
     turns_of,
     used_roads,
@@ -200,7 +201,7 @@ class _LotImport(MapImport):
         super().__init__(name, place, frame or map_frame(place.elements))
         self.options, self.box = options, options.box(self.frame)
         self.notes: list[str] = []
-        self.roads = read_roads(place.elements, self.frame, self.left_out)
+        self.roads = read_roads(place.elements, self.frame, self.left_out, left_hand=options.left_hand)
         if self.box is not None:
             box = shapely.box(*self.box)
             self.roads = [part for road in self.roads for part in clipped_road(road, box)]
@@ -325,7 +326,7 @@ class _LotImport(MapImport):
             entries = (
                 street_junctions(roads, streets)
                 if edge is None
-                else open_ends(roads, edge, self.points(lambda e: not BLIND.isdisjoint(e.tags.items())))
+                else open_ends(roads, edge, self.points(is_blind))
             )
         goals, goal_note = points_in_frame(self.frame, self.options.goals), None
         if not len(goals):
@@ -422,6 +423,11 @@ def _is_parking(element: OsmElement) -> bool:
     return tags.get("amenity") in ("parking", "parking_space") or (
         "highway" in tags and any(key.startswith(("parking:", "parking:lane:")) for key in tags)
     )
+
+
+def is_blind(element: OsmElement) -> bool:
+    """Whether a node ends a street where the map goes on."""
+    return stops_cars(element.tags) or not BLIND.isdisjoint(element.tags.items())
 
 
 def refuse_far_away(elements: Sequence[OsmElement]) -> None:

@@ -35,6 +35,8 @@ MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
 """Keys that distinguish elements of OpenStreetMap from other GeoJSON."""
 KEYS = (*MAPPED_KEYS, "noexit", "shop", "office", "craft", "healthcare", "tourism", "leisure")
 """Keys of the elements that an import reads."""
+NODE_KEYS = (*KEYS, "barrier", "motorcar", "motor_vehicle", "vehicle")
+"""Keys of the nodes that an import reads."""
 MOST_ELEMENTS = 5_000_000
 """Maximum number of nodes, ways and relations of one file: a city of a million people."""
 CAR_KEYS = frozenset(("motorcar", "motor_vehicle", "vehicle"))
@@ -207,7 +209,7 @@ class _RawElements:
             self.needed_nodes.update(refs)
 
     def add_node(self, node: Any) -> None:
-        is_wanted = any(key in node.tags for key in KEYS)
+        is_wanted = any(key in node.tags for key in NODE_KEYS)
         if is_wanted or node.id in self.needed_nodes:
             name, at = f"node/{node.id}", node.location
             position = _position(name, at.lat_without_check(), at.lon_without_check())

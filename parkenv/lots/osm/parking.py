@@ -213,7 +213,7 @@ def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float,
         middle, ranks = (start + end) / 2, np.arange(n) - (n - 1) / 2
         fitted = replace(how, length=min(how.length, step / more)) if parallel else how
         anchors = row_anchors(road.points, middle + ranks * step, fitted.pitch, side)
-        rows.append(row_at(anchors, offset, fitted, with_points=road.oneway or side == "right"))
+        rows.append(row_at(anchors, offset, fitted, with_points=road.oneway or side == road.near_side))
     return Slots.joined(rows)
 
 
@@ -357,7 +357,7 @@ def _row(
     hit = shapely.distance(shapely.points(anchors.xy), shapely.intersection(rays, outline))
     reached = np.isfinite(np.atleast_1d(hit))
     offset = np.maximum(np.where(reached, hit, 0.0), road.half_width)
-    return row_at(anchors, offset, how, with_points=road.oneway or side == "right")[reached]
+    return row_at(anchors, offset, how, with_points=road.oneway or side == road.near_side)[reached]
 
 
 def _fitting(

@@ -5,7 +5,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Literal, NamedTuple
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -55,6 +56,13 @@ _AISLE_LIMIT = 10.0  # km/h, of a `service=parking_aisle`
 _NAMED_LIMITS = {"walk": 7.0, "none": 100.0, "urban": 50.0, "rural": 70.0, "living_street": 7.0}
 AISLE_WIDTH = 6.0  # the same for a `service=parking_aisle`
 LANE_WIDTH = 3.0  # width of each of the tagged `lanes`, m
+PASSABLE = (
+    *("no", "entrance", "cattle_grid", "toll_booth", "border_control", "checkpoint", "sally_port", "coupure"),
+    *("height_restrictor", "width_restrictor", "arch", "bump_gate"),
+)
+"""Values of `barrier` that let cars pass unless access tags say otherwise."""
+TICKET_GATE = "lift_gate"  # without access tags on a service road: of a car park, open to every car
+BARRIER_GAP = 1.5  # m, between a barrier and the roads that end before it
 NOT_FOR_PARKING = ("drive-through", "emergency_access", "bus")
 """Kinds of `highway=service` that are not lanes."""
 
@@ -80,6 +88,12 @@ class Road:
     oneway: bool  # whether cars may drive only in the order of the points
     # whether the points are in reverse order of the way, which swaps its tags for left and right
     turned: bool
+    left_hand: bool = False  # whether cars keep to the left
+
+    @property
+    def near_side(self) -> Side:
+        """The side on which cars drive in the order of the points, if the road is two-way."""
+        return "left" if self.left_hand else "right"
 
     def side_of_way(self, side: Side) -> Side:
         return ("right" if side == "left" else "left") if self.turned else side
@@ -156,19 +170,81 @@ def road_of(
 
 
 def read_roads(
-    elements: Iterable[OsmElement], frame: LocalFrame, left_out: dict[str, list[str]], *, town: bool = False
+    elements: Sequence[OsmElement],
+    frame: LocalFrame,
+    left_out: dict[str, list[str]],
+    *,
+    town: bool = False,
+    left_hand: bool = False,
 ) -> list[Road]:
+    """Return the roads for cars, which end before nodes that stop these."""
     roads: list[Road] = []
+    barriers = barriers_of(elements)
+    met: dict[str, dict[str, None]] = {}  # ids of the barriers on roads
+    at = cKDTree(frame.to_xy([e.lines[0][0] for e in barriers]))
     for element in elements:
         if element.is_node or "highway" not in element.tags:
             continue
         for line in element.lines:
             road = road_of(element.id, element.tags, frame.to_xy(line), town=town)
             if isinstance(road, Road):
-                roads.append(road)
+                road = replace(road, left_hand=left_hand)
+                roads += _parts_between(road, barriers, at, met)
             elif road is not None and element.id not in left_out.setdefault(road, [])[-1:]:
                 left_out[road].append(element.id)
+    left_out.update({reason: list(ids) for reason, ids in met.items()})
     return roads
+
+
+def barriers_of(elements: Iterable[OsmElement]) -> list[OsmElement]:
+    return [e for e in elements if e.is_node and stops_cars(e.tags)]
+
+
+def stops_cars(tags: Mapping[str, str]) -> bool:
+    """Whether cars cannot pass a node: a barrier, or one that is closed to motor vehicles.
+
+    Access tags decide; what is locked opens only to vehicles that are named.
+    """
+    kind = tags.get("barrier")
+    named = any(key in tags for key in ("motorcar", "motor_vehicle", "vehicle"))
+    if kind is None or closed_to_cars(tags):
+        on_street = kind is not None or not {"amenity", "entrance", "building", "shop"}.intersection(tags)
+        return closed_to_cars(tags) is not None and on_street and (kind is not None or named)
+    if named or (tags.get("locked") != "yes" and "access" in tags):
+        return False
+    is_open = tags.get("locked") == "no" or (kind == "kerb" and tags.get("kerb") not in ("raised", "regular"))
+    return tags.get("locked") == "yes" or not (kind in PASSABLE or is_open)
+
+
+def _parts_between(
+    road: Road, barriers: Sequence[OsmElement], at: cKDTree, met: dict[str, dict[str, None]]
+) -> list[Road]:
+    """Return the parts of a road that end before the barriers on it."""
+    stops = np.zeros(len(road.points), bool)
+    near: Any = at.query_ball_point(road.points, NODE_TOLERANCE)
+    for i, each in enumerate(near):
+        for tags, name in ((barriers[k].tags, barriers[k].id) for k in each):
+            passes = road.rank is not Rank.STREET and _is_ticket_gate(tags)
+            stops[i] |= not passes
+            what = f"barrier={tags['barrier']}" if "barrier" in tags else str(closed_to_cars(tags))
+            reason = (
+                f"{what} on service roads, taken for a ticket gate" if passes else f"roads through {what}"
+            )
+            met.setdefault(reason, {})[name] = None
+    last = len(stops) - 1
+    cuts = [i for i, stop in enumerate(stops) if stop or i in (0, last)]
+    parts = []
+    for i, j in pairwise(cuts):
+        points = road.points[i : j + 1].copy()
+        for is_cut, end, inner in ((stops[i], 0, 1), (stops[j], -1, -2)):
+            step = points[inner] - points[end]
+            points[end] += is_cut * min(BARRIER_GAP / np.hypot(*step), 0.4) * step
+        parts.append(replace(road, points=points))
+    return parts
+
+
+def _is_ticket_gate(tags: Mapping[str, str]) -> bool:
+    return tags.get("barrier") == TICKET_GATE and not closed_to_cars(tags) and tags.get("locked") != "yes"
 
 
 def closed_to_cars(tags: Mapping[str, str]) -> str | None:
@@ -254,8 +330,7 @@ def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) 
     if at_edge.any():
         return xy[np.flatnonzero(at_edge)]
     if len(blind):
-        away = blind[None] - xy[:, None]
-        xy = xy[np.flatnonzero(np.hypot(away[..., 0], away[..., 1]).min(axis=1) > 0.1)]
+        xy = xy[np.flatnonzero(cKDTree(blind).query(xy)[0] > BARRIER_GAP + 0.1)]
     return xy
 
 

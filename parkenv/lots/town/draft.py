@@ -121,6 +121,7 @@ def import_town(
     listed_only: bool = False,
     bounds: tuple[tuple[float, float], tuple[float, float]] | None = None,
     untagged_kerbs: float = 1.0,
+    left_hand: bool = False,
 ) -> TownDraft:
     """Draft a town from an OpenStreetMap file; see the module for the rules.
 
@@ -131,7 +132,7 @@ def import_town(
     listed = [] if car_parks is None else read_listed(Path(car_parks))
     with unread_table() as unread, naming(path):
         place = read_map(path)
-        town = _TownImport(place_name(path), place if bounds is None else place.within(bounds))
+        town = _TownImport(place_name(path), place if bounds is None else place.within(bounds), left_hand)
         town.read_drawn()
         town.read_kerbs(untagged_kerbs)
         town.read_counted()
@@ -145,7 +146,7 @@ def import_town(
 
 
 class _TownImport(MapImport):
-    def __init__(self, name: str, place: OsmMap) -> None:
+    def __init__(self, name: str, place: OsmMap, left_hand: bool) -> None:
         # What an extract's edge cuts may have lost its nodes, too.
         elements = [e.closed() if is_parking_area(e) and not e.is_node else e for e in place.elements]
         streets = [e for e in elements if "highway" in e.tags and not e.is_node]
@@ -154,7 +155,7 @@ class _TownImport(MapImport):
         refuse_far_away(streets)
         frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
         super().__init__(name, replace(place, elements=elements), frame)
-        self.streets, self.closed_roads = read_streets(elements, self.frame)
+        self.streets, self.closed_roads = read_streets(elements, self.frame, left_hand)
         self.roads = self.streets.roads_of(self.streets.kept)
         self.lines = linestrings([road.points for road in self.roads])
         self.tree = shapely.STRtree(self.lines)

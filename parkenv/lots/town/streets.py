@@ -24,7 +24,7 @@ from parkenv.lots.draft import LeftOut
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import OsmElement
-from parkenv.lots.osm.roads import Rank, Road, read_roads
+from parkenv.lots.osm.roads import BARRIER_GAP, Rank, Road, barriers_of, read_roads
 from parkenv.world.drive_graph import linestrings, node_labels
 from parkenv.world.lot import MOVES, Lane
 
@@ -50,10 +50,11 @@ LONGEST_BEYOND = 600.0  # m, longest way beyond the edge of the map that is assu
 class Streets:
     """The roads of a town, whole ways that cars may drive, in pieces between junctions; `cut` are those at the edge."""
 
-    def __init__(self, roads: tuple[Road, ...], cut: frozenset[str]) -> None:
+    def __init__(self, roads: tuple[Road, ...], cut: frozenset[str], blind: FloatArray) -> None:
         if not roads:
             raise InputError("no street that cars may drive in it")
         self.roads, self.cut = roads, cut
+        self.blind = shapely.multipoints(blind)  # m, barriers, where no street leads on
         count = np.array([len(road.points) for road in roads])
         xy = np.concatenate([road.points for road in roads])
         label, of = node_labels(xy), np.repeat(np.arange(len(count)), count)
@@ -118,6 +119,7 @@ class Streets:
         ways = [np.bincount(np.r_[self.nodes[real, end], two_way], minlength=n) for end in (1, 0)]
         hull = shapely.concave_hull(shapely.multipoints(self.node_xy), ratio=0.4)
         away = np.asarray(shapely.distance(shapely.points(self.node_xy), shapely.boundary(hull)))
+        blind = np.asarray(shapely.dwithin(shapely.points(self.node_xy), self.blind, BARRIER_GAP + 0.1))
         traffic, enters, leaves = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
         for piece in real.tolist():
             road = self.roads[self.road[piece]]
@@ -129,6 +131,8 @@ class Streets:
                 # Where the edge cuts a way at a junction, other streets end there, too.
                 leads_on = users[node] == 1 and (near or kind in THROUGH or cut)
                 leads_on |= road.oneway and near and not ways[end][node]
+                if blind[node]:
+                    continue
                 if leads_on or (is_end[end] and cut and away[node] <= AT_EDGE):
                     traffic[node] = max(traffic[node], weight)
                     enters[node] |= end == 0 or not road.oneway
@@ -301,8 +305,12 @@ def _joined(lanes: Sequence[Lane], mouths: FloatArray) -> list[Lane]:
     ]
 
 
-def read_streets(elements: Sequence[OsmElement], frame: LocalFrame) -> tuple[Streets, tuple[LeftOut, ...]]:
+def read_streets(
+    elements: Sequence[OsmElement], frame: LocalFrame, left_hand: bool
+) -> tuple[Streets, tuple[LeftOut, ...]]:
     left_out: dict[str, list[str]] = {}
-    roads = read_roads(elements, frame, left_out, town=True)
+    roads = read_roads(elements, frame, left_out, town=True, left_hand=left_hand)
+    blind = frame.to_xy([e.lines[0][0] for e in barriers_of(elements)])
     cut = frozenset(element.id for element in elements if element.cut)
-    return Streets((*roads, *Streets(tuple(roads), cut).ways_beyond()), cut), LeftOut.by_reason(left_out)
+    beyond = Streets(tuple(roads), cut, blind).ways_beyond()
+    return Streets((*roads, *beyond), cut, blind), LeftOut.by_reason(left_out)

@@ -371,7 +371,7 @@ def kerb_sides(
     for k, road in enumerate(roads):
         kind = road.tags["highway"]
         total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
-        for side in SIDES:
+        for side in sorted(SIDES, key=road.near_side.__eq__):
             tagged = road.side_of_way(side)
             by_tag = any(
                 f"{key}:{at}" in road.tags for key in ("parking", "parking:lane") for at in (tagged, "both")
@@ -394,7 +394,7 @@ def kerb_sides(
                 if (
                     k not in street
                     or any(road.tags.get(key, "no") != "no" for key in ("bridge", "tunnel", "junction"))
-                    or (side == "left" and _is_half(road))
+                    or (side != road.near_side and _is_half(road))
                 ):
                     continue
                 closed = closed + lonely[k]
