@@ -58,7 +58,7 @@ def search_sensors():
     image = np.full((300, 400, 3), PALETTE["ground"], np.uint8)
 
     def picture(observation):
-        pose, ranges = observation["pose"][0].astype(float), observation["scan.laser"][0]
+        pose, ranges = observation["pose"][0].astype(float), observation["scan_laser"][0]
         x, y, yaw = mount.in_world(pose)
         hit = ranges < model.max_range
         ends = [x, y] + ranges[hit, None] * np.stack(
@@ -71,7 +71,7 @@ def search_sensors():
             MapView.around(pose[:2], (400, 300), 9.0),
             [*layers, Marks(posed(ends), DISC, "parked", px=3.5)],
         )
-        both = np.hstack([observation["image.right"][0], above])
+        both = np.hstack([observation["image_right"][0], above])
         return cv2.resize(both, (560, 210), interpolation=cv2.INTER_AREA)
 
     frames = [picture(env.reset(seed=0)[0])]

@@ -16,7 +16,9 @@ for kind in ("perpendicular", "oblique", "parallel"):
             action, memory = driver.predict(observation, memory)
             observation, reward, terminated, truncated, info = env.step(action)
             over = terminated or truncated
-        outcome = "parked" if info["is_success"] else f"failed ({info['contact'] or 'out of time'})"
+        outcome = (
+            "parked" if info["is_success"] else f"failed ({env.unwrapped.state.contact or 'out of time'})"
+        )
         print(
             f"{kind:13s} {outcome} after {info['time_s']:4.1f} s and {info['direction_changes']} changes of direction, "
             f"{100 * info['position_error_m']:.0f} cm off"

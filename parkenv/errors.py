@@ -93,14 +93,19 @@ def require_one_of(name: str, value: object, known: Collection[object]) -> None:
         raise InputError(f"{name} is {value!r:.60}, want one of {', '.join(map(str, known)) or 'none'}")
 
 
+_FOREIGN_OPTIONS = ("minari_autoseed",)
+"""Options of `reset` that wrappers of other libraries take for themselves and pass on."""
+
+
 def reset_options(options: object, known: Collection[str]) -> dict[str, Any]:
     if options is None:
         return {}
     if not isinstance(options, Mapping):
         raise InputError(f"options is {options!r:.60}, want a dictionary or None")
-    for name in options:
+    given = {name: value for name, value in options.items() if name not in _FOREIGN_OPTIONS}
+    for name in given:
         require_one_of("option of reset", name, known)
-    return dict(options)
+    return given
 
 
 def require_keywords(function: str, given: Iterable[str], known: Collection[str]) -> None:

@@ -25,6 +25,7 @@ except ImportError as error:
     raise DependencyNotInstalled(needs_extra("parkenv.lot_v0", "multi")) from error
 
 from parkenv.engine.fleet import DriverKind, Fleet, FleetOptions
+from parkenv.engine.kernel import read_step
 from parkenv.engine.records import SEARCHING, TRUNCATED
 from parkenv.engine.spaces import action_number
 from parkenv.files.known_names import MAX_CARS
@@ -111,6 +112,10 @@ class _CarsAsAgents:
             self._episode += 1
         self.fleet.reset(self._seed, self._episode)
         return self.possible_agents[: len(self.fleet.cars)]
+
+    def _blank_info(self, car: int) -> dict[str, Any]:
+        blank = (0.0,) * 14 + (0, 0, False, False, 0)
+        return read_step(int(self.fleet.cars["scenario_index"][car]), blank)[3]
 
     def _blank_observation(self, car: int) -> dict[str, Any]:
         boxes = {name: box for name, box in self._observation_space.items() if isinstance(box, spaces.Box)}
@@ -247,7 +252,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
         self.terminations = dict.fromkeys(self.agents, False)
         self.truncations = dict.fromkeys(self.agents, False)
         self.infos: dict[str, dict[str, Any]] = {
-            agent: {"scenario": self.scenario.name} for agent in self.agents
+            agent: self._blank_info(_car_of(agent)) for agent in self.agents
         }
         self._skip_agent_selection = None
         self._select()
@@ -336,7 +341,7 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
         del options
         self.agents = list(self._begin(seed))
         self._observations = {agent: self._blank_observation(_car_of(agent)) for agent in self.agents}
-        self._infos = {agent: {"scenario": self.scenario.name} for agent in self.agents}
+        self._infos = {agent: self._blank_info(_car_of(agent)) for agent in self.agents}
         self._tick = 0
         self._advance({}, {})
         return dict(self._observations), dict(self._infos)

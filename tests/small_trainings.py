@@ -3,12 +3,15 @@
 import dataclasses
 
 import pytest
+import torch
+from numba import get_num_threads
 
 from parkenv.studies.training import configs
 from parkenv.studies.training.spec import TrainingSpec
-from parkenv.studies.training.training import Training, save_checkpoint, use_one_thread
+from parkenv.studies.training.training import Training, save_checkpoint
 
-use_one_thread()  # as in the workers of a study: tests run side by side
+get_num_threads()  # first: it sets the number that PyTorch has, too
+torch.set_num_threads(1)  # tests run side by side
 
 
 def make_small(patch):

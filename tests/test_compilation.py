@@ -7,6 +7,7 @@ import pickle
 import pkgutil
 import subprocess
 import sys
+import tempfile
 import typing
 from pathlib import Path
 
@@ -144,9 +145,25 @@ def test_of_processes_that_need_the_same_code_one_compiles_it(own, tmp_path):
     assert all(path.suffix == ".nbc" for path in cache.rglob("*") if path.is_file())
 
 
-def test_without_compilation_functions_run_as_they_are_written(own, tmp_path):
-    assert result(start(own, tmp_path / "cache", NUMBA_DISABLE_JIT="1")) == (4.0, [])
-    assert not kept(tmp_path)
+def test_without_compilation_one_line_says_what_is_wanted(own, tmp_path):
+    process = start(own, tmp_path / "cache", NUMBA_DISABLE_JIT="1")
+    assert "NUMBA_DISABLE_JIT is set, want it unset" in process.communicate()[1].splitlines()[-1]
+    assert process.returncode == 1
+
+
+@pytest.mark.parametrize("raises", [False, True])
+def test_without_a_home_code_is_kept_in_a_temporary_folder(monkeypatch, tmp_path, raises):
+    """No HOME, and no entry of the user in the system's table: versions of platformdirs differ in what they do."""
+
+    def no_home(*_, **__):
+        if raises:
+            raise RuntimeError("could not determine the home directory")
+        return Path("~/.cache/parkenv")
+
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(code_files, "user_cache_path", no_home)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert code_files.cache_folder() == tmp_path / f"parkenv-{os.getuid()}" / "compiled"
 
 
 def test_code_is_kept_in_the_users_folder_unless_another_is_named(monkeypatch, tmp_path):

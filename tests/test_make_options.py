@@ -3,12 +3,17 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import flatdim
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
+from parkenv import lot_v0
 from parkenv.envs.flat_ids import OPTIONS
+from sim_sensors.laser.scanner import LaserScanner
+from sim_sensors.rig import Mount, SensorRig
 
 SCALE, N = 0.01, 4
 
@@ -79,3 +84,53 @@ def test_ids_for_learners_that_take_no_options():
     assert env.step(3)[1:3] == same.step(3)[1:3]
     envs = gym.make_vec("parkenv-flat/mini-v2", 2)
     assert envs.reset(seed=2)[0].shape == (2, 86)
+
+
+def kinds(info):
+    """Keys of an info, with the kind of each number."""
+    return {key: kinds(v) if isinstance(v, dict) else np.asarray(v).dtype.kind for key, v in info.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("Search-v2", {"scenario": ["mini", "street"]}),
+        ("SearchSensors-v2", {"scenario": "mini", "observation": "scan"}),
+        ("SearchPerception-v2", {"scenario": "mini", "picture_width": 100}),
+        ("Drive-v1", {"lot": "mini"}),
+    ],
+)
+def test_infos_hold_numbers_under_the_same_keys_after_reset_and_step(name, options):
+    env = gym.make(f"parkenv/{name}", **options)
+    _, info = env.reset(seed=0, options={"minari_autoseed": False})
+    assert kinds(info) == kinds(env.step(env.action_space.sample())[4])
+    assert {kind for value in kinds(info).values() for kind in value} <= {*"biuf", *info["reward_terms"]}
+
+
+def test_infos_of_batches_and_of_cars_hold_the_same():
+    single, batch = (
+        gym.make_vec("parkenv/Search-v2", 3, mode, scenario=["mini", "street"])
+        for mode in ("sync", "vector_entry_point")
+    )
+    ours, theirs = batch.reset(seed=4)[1], single.reset(seed=4)[1]
+    assert kinds(ours) == kinds(theirs)
+    np.testing.assert_equal(ours, theirs)
+    cars = lot_v0.parallel_env(scenario="mini", cars=2)
+    _, before = cars.reset(seed=0)
+    for _ in range(30):
+        *_, after = cars.step(dict.fromkeys(cars.agents, 3))
+        assert all(kinds(info) == kinds(before["car_0"]) for info in after.values())
+    assert after["car_0"]["total_s"] > 0.0
+
+
+def test_policies_of_stable_baselines_learn_from_sensors():
+    rig = SensorRig(
+        lasers=(("front.left", LaserScanner(n_beams=91), Mount()),), cameras=SensorRig.thesis().cameras
+    )
+    seen = gym.make("parkenv/SearchSensors-v2", scenario="mini", rig=rig).observation_space
+    assert {"image_right", "scan_front_left"} < set(seen)
+    env = gym.make("parkenv/SearchSensors-v2", scenario="mini", rig=rig, captures=1, observation="scan")
+    torch.set_num_threads(1)
+    network = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}}
+    model = PPO("MultiInputPolicy", env, n_steps=100, batch_size=50, n_epochs=1, policy_kwargs=network)
+    assert model.learn(200).num_timesteps == 200

@@ -40,7 +40,7 @@ def expected(measured, goal):
         ahead, left = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
         numbers += [1.0, *np.clip([ahead / 30, left / 30], -1, 1), math.cos(turn), math.sin(turn)]
         edges = np.arange(73) * 1081 // 72
-        nearest = [one["scan.laser"][0, a:b].min() for a, b in pairwise(edges)]
+        nearest = [one["scan_laser"][0, a:b].min() for a, b in pairwise(edges)]
         numbers += [1.0 / (1.0 + metres / 5.0) for metres in nearest]
     return np.array(numbers + [0.0] * (FIXED + PER_SCAN * SCANS - len(numbers)))
 

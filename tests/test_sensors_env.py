@@ -116,7 +116,7 @@ def test_scans_alone_are_those_beside_the_pictures():
 
 def test_pictures_of_another_width():
     env = make(picture_width=160)
-    assert env.reset(seed=1)[0]["image.right"].shape[1:] == (120, 160, 3)
+    assert env.reset(seed=1)[0]["image_right"].shape[1:] == (120, 160, 3)
     assert make().unwrapped.rig is SMALL_RIG
     for given, width in ((None, PICTURE_WIDTH), (640, 640)):
         for name in ("SearchSensors", "SearchPerception"):

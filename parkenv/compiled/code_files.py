@@ -15,6 +15,7 @@ import pickle
 import secrets
 import shutil
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Iterator
@@ -42,10 +43,17 @@ FunctionIdentity._unique_ids = itertools.count(secrets.randbits(48))
 
 
 def cache_folder() -> Path:
-    """Return the folder of compiled code: `NUMBA_CACHE_DIR`, else one in the user's cache folder."""
+    """Return the folder of compiled code: `NUMBA_CACHE_DIR`, else one in the user's cache folder or a temporary one."""
     # Numba's own setting may come from a file in the working folder.
-    configured = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(configured) if configured else user_cache_path("parkenv", appauthor=False) / "compiled"
+    if configured := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(configured)
+    try:
+        folder = user_cache_path("parkenv", appauthor=False)
+    except RuntimeError:
+        folder = Path("~")
+    # Where the user has no home, versions of platformdirs raise an error or leave "~" in the path.
+    own = folder if folder.is_absolute() else Path(tempfile.gettempdir(), f"parkenv-{os.getuid()}")
+    return own / "compiled"
 
 
 class CodeFiles:

@@ -33,6 +33,11 @@ from numba.core.types.misc import unliteral
 
 from parkenv.compiled.clock import counted
 from parkenv.compiled.code_files import CodeFiles
+from parkenv.errors import require
+
+require(
+    not numba.config.DISABLE_JIT, "NUMBA_DISABLE_JIT is set, want it unset: parkenv runs compiled code only"
+)
 
 # Numba has this flag for its own parallel loops, and no option for it.
 CPUTargetOptions.noalias = TargetOptions.Mapping("noalias")
@@ -74,8 +79,6 @@ def _compiled(
         function = _with_single_literals(function)
     if distinct:
         options["noalias"] = True
-    if numba.config.DISABLE_JIT:
-        return function
     # Numba's wrapper for calls from C takes a tenth of the time of compiling, and next to nobody calls it.
     options = {"nopython": True, "boundscheck": None, "no_cfunc_wrapper": True, **options}
     outer = _Function(function, targetoptions=options)

@@ -277,8 +277,7 @@ class FleetMemory:
 
     def outcome(self, car: int) -> StepOutcome:
         address = self._search_of(car)
-        scenario = self.scenarios[self.cars["scenario_index"][car]]
-        reward, _, _, info = read_step(scenario.name, step_result_at(address))
+        reward, _, _, info = read_step(int(self.cars["scenario_index"][car]), step_result_at(address))
         return StepOutcome(bool(self.search_of(address)["n_steps"]), reward, info)
 
     def _search_of(self, car: int) -> int:

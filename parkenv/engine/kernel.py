@@ -76,8 +76,8 @@ STEP_RESULT = ("reward", *REWARD_TERMS, *METRICS, "over", "vertex")
 """Names of the numbers that a step returns; metrics are those of the episode so far."""
 
 
-def read_step(scenario: str, result: tuple[Any, ...]) -> tuple[float, bool, int, dict[str, Any]]:
-    """Return reward, over, vertex and `info` of a step, from the name of the scenario and numbers of `STEP_RESULT`.
+def read_step(scenario_index: int, result: tuple[Any, ...]) -> tuple[float, bool, int, dict[str, Any]]:
+    """Return reward, over, vertex and `info` of a step, from the index of the scenario and numbers of `STEP_RESULT`.
 
     Written out: with `dict(zip(...))` a step would take a fifth longer.
     """
@@ -90,7 +90,7 @@ def read_step(scenario: str, result: tuple[Any, ...]) -> tuple[float, bool, int,
         "reward_terms": terms, "drive_s": drive_s, "failed_s": failed_s, "walk_s": walk_s,
         "parking_cost_s": parking_cost_s, "gave_up_s": gave_up_s, "total_s": total_s, "driven_m": driven_m,
         "walked_m": walked_m, "failed_parks": failed_parks, "slots_passed": slots_passed, "parked": parked,
-        "scenario": scenario,
+        "scenario_index": scenario_index,
     }  # fmt: skip
     return reward, over, vertex, info
 

@@ -45,6 +45,9 @@ SUBSTEPS = 2  # physics steps per action
 CONTROL_S = SUBSTEPS * PHYSICS_S  # control period, s
 CONTACT_COST = 200.0  # default cost of a contact, s: more than any drive within the step limit
 REWARD_TERMS = ("time", "approach", "contact")
+LEFT_AREA = "left the area"
+CONTACTS = ("", *(kind.label for kind in ObstacleKind if kind), LEFT_AREA)
+"""What `info["contact"]` numbers."""
 
 
 class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
@@ -116,14 +119,15 @@ length and width over the car's |
 
     1. parked (`info["is_success"]`): the footprint is inside the slot, its centre at most 0.25 m from the slot's, the
        yaw within 5°, and the speed at most 0.05 m/s;
-    2. a contact; `info["contact"]` names the obstacle;
-    3. the car left the area of 27 m around the slot along the lot's axes (`contact` is "left the area").
+    2. a contact; `info["contact"]` is the obstacle's number: 1 parked car, 2 kerb, 3 wall, 4 moving car, 5 pedestrian;
+    3. the car left the area of 27 m around the slot along the lot's axes (`contact` is 6).
 
     Truncated after 600 steps, one minute.
 
     ## Info
-    `time_s`, `driven_m`, `direction_changes`, `position_error_m`, `angle_error_rad`, `contact` (empty without one),
-    `is_success` and `parked`; after a step also `reward_terms`.
+    Numbers under the same keys after reset and step: `time_s`, `driven_m`, `direction_changes`, `position_error_m`,
+    `angle_error_rad`, `contact` (0 without one), `is_success`, `parked` and `reward_terms`.
+    Hindsight relabelling needs the contact: `HerReplayBuffer(..., copy_info_dict=True)` in stable-baselines3.
 
     ## Arguments
     - `lot`: a `ParkingLot`, the name of a packaged lot (campus, jam, street, mini), or a lot file.
@@ -261,7 +265,7 @@ length and width over the car's |
             self.render()
         observation = self._observation()
         self._update_errors(observation)
-        return observation, self._info(self._state)
+        return observation, self._info(self._state, (0.0,) * len(REWARD_TERMS))
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         state = self.state
@@ -294,12 +298,11 @@ length and width over the car's |
         observation = self._observation()
         success = self._update_errors(observation)
         if not touched and self._away > AREA:
-            state.contact = "left the area"
+            state.contact = LEFT_AREA
         state.parked = success and not state.contact
         state.over = state.parked or bool(state.contact)
         terms = self._terms(success, bool(state.contact), self._errors[0], self._errors[1])
-        info = self._info(state)
-        info["reward_terms"] = dict(zip(REWARD_TERMS, terms, strict=True))
+        info = self._info(state, terms)
         if self.render_mode == "human":
             self.render()
         return observation, sum(terms), state.over, False, info
@@ -415,10 +418,11 @@ length and width over the car's |
         approach = -CONTROL_S * (distance / 10.0 + angle / math.pi) if self._dense else 0.0
         return -CONTROL_S, approach, -self._contact_cost if contact else 0.0
 
-    def _info(self, state: DriveState) -> dict[str, Any]:
+    def _info(self, state: DriveState, terms: Sequence[float]) -> dict[str, Any]:
         return {
+            "reward_terms": dict(zip(REWARD_TERMS, terms, strict=True)),
             "is_success": state.parked,
-            "contact": state.contact,
+            "contact": CONTACTS.index(state.contact),
             "time_s": state.time,
             "driven_m": state.driven_m,
             "direction_changes": state.direction_changes,

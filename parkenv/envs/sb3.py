@@ -111,7 +111,7 @@ class SearchVecEnv(BatchVecEnv):
     Args:
         num_envs: number of searches.
         scenario: a scenario, its name, a file, a folder of files, or a sequence of these; if there are several, one is
-            drawn for each episode, and `info["scenario"]` names it at the end.
+            drawn for each episode, and `info["scenario_index"]` is its index at the end.
         reward_scale: factor of the rewards in seconds; returns near one are easiest to learn.
         k: number of slots in the `local` observation, 5 if None.
         observation: `local`; for a single lot also `full`.

@@ -29,7 +29,7 @@ from gymnasium import spaces
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.records import N_ACTIONS
-from parkenv.envs.sensors import SearchSensorsEnv
+from parkenv.envs.sensors import SearchSensorsEnv, sensor_key
 from parkenv.errors import require_whole
 
 SCANS = 4
@@ -77,7 +77,7 @@ class ScanObservation(
         self._scans: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=k)
         problem = env.unwrapped.scenario
         self._goal = problem.lot.goals[problem.goal]
-        self._laser = f"scan.{env.unwrapped.rig.lasers[0][0]}"
+        self._laser = sensor_key("scan", env.unwrapped.rig.lasers[0][0])
         self.observation_space = spaces.Dict(
             {
                 "scan": spaces.Box(-1.0, 1.0, (FIXED + PER_SCAN * k,), np.float32),

@@ -20,6 +20,7 @@ from parkenv.engine.kernel import (
     read_step,
     step_exact_at,
     step_noisy_at,
+    step_result_at,
 )
 from parkenv.engine.local_observation import (
     NEAR_SLOTS,
@@ -133,22 +134,24 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
       repeats it at every step until the next reset.
     - `close()` ends the episode, too.
 
-    `info` holds the episode's metrics so far: drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m,
-    walked_m, failed_parks, slots_passed (slots whose vertex the car stopped at) and parked. The step count of a
-    time-limit wrapper is not part of `get_state`.
+    `info` holds numbers under the same keys after reset and step: the episode's metrics so far, drive_s, failed_s,
+    walk_s, parking_cost_s, gave_up_s, total_s, driven_m, walked_m, failed_parks, slots_passed (slots whose vertex the
+    car stopped at) and parked; scenario_index; and reward_terms. The step count of a time-limit wrapper is not part of
+    `get_state`.
 
     ## Several scenarios
     With several scenarios, each episode is in one of them, drawn from the seed and the number of the episode: the same
-    seed gives the same ones, whatever the agent does. `info["scenario"]` names it after each reset and step, and
-    `env.unwrapped.scenario` is it. The observation space fits the largest lot: in smaller ones, slots past the last
-    are taken (1) and never observed. `observation="local"` has the same size on every lot.
+    seed gives the same ones, whatever the agent does. `env.unwrapped.scenario` is the scenario of the episode,
+    `info["scenario_index"]` its index in `env.unwrapped.scenarios`. The observation space fits the largest lot: in
+    smaller ones, slots past the last are taken (1) and never observed. `observation="local"` has the same size on
+    every lot.
 
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
     >>> env = gym.make("parkenv/Search-v2", scenario=["campus", "street", "mini"], observation="local")
-    >>> [env.reset(seed=seed)[1]["scenario"] for seed in range(5)]
-    ['mini', 'campus', 'street', 'campus', 'campus']
+    >>> [env.reset(seed=seed)[1]["scenario_index"] for seed in range(5)]
+    [2, 0, 1, 0, 0]
 
     ```
 
@@ -251,7 +254,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if index == self._scenario_index:
             return
         self._scenario_index, self.scenario = index, self.scenarios[index]
-        self._name, self._is_exact = self.scenario.name, self.scenario.observes_exactly
+        self._is_exact = self.scenario.observes_exactly
         self._copy_mask = self._copy_masks[index]
         self._close_window()
 
@@ -313,14 +316,15 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
             self.render()
-        return self._observation(self._state.vertex), {"scenario": self.scenario.name}
+        info = read_step(self._scenario_index, step_result_at(self._address))[3]
+        return self._observation(self._state.vertex), info
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         if self._over:
             raise gym.error.ResetNeeded("the search has not begun, is over, or was closed: call reset()")
         number = action_number(action)
         # A wrapper's time limit may end the episode at any step, so every step has the metrics.
-        reward, over, vertex, info = read_step(self._name, self._step(self._address, number))
+        reward, over, vertex, info = read_step(self._scenario_index, self._step(self._address, number))
         if self._needs_python:
             raise_error()
         path = self._state.path

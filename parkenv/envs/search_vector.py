@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
 # Gymnasium's names of the masks that say which searches have a metric.
-_WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "scenario"))
+_WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "scenario_index"))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
 # Types and places of the metrics and the step's terms in a SEARCH record.
 _PLACES = [dict(SEARCH.fields or {})[name][:2] for name in (*METRICS, *STEP_FIELDS)]
@@ -76,9 +76,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     ## Several scenarios
     Each search draws the scenario of each of its episodes, also at automatic resets, as `parkenv/Search-v2` does with
-    its seed. `scenario_index` are the indices into `scenarios`; `info["scenario"]` names them after `reset`, and those
-    of the searches that have ended. All searches share one set of tables; `table_bytes` and `memory_bytes` say how
-    large they are. `n_scenarios` limits the draw to the first scenarios, from the next episodes on.
+    its seed. `scenario_index` are the indices into `scenarios`; `info["scenario_index"]` has them after `reset`, and
+    those of the searches that have ended. All searches share one set of tables; `table_bytes` and `memory_bytes` say
+    how large they are. `n_scenarios` limits the draw to the first scenarios, from the next episodes on.
 
     ## Episode end
     As in `parkenv/Search-v2`; truncated after `max_episode_steps`. `autoreset_mode` then applies:
@@ -88,8 +88,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
       and infos;
     - DISABLED: the caller resets searches with `reset(options={"reset_mask": ...})`.
 
-    When a search ends, `info` has its metrics, as in the single environment; the masks `_drive_s` and so on say which
-    searches have ended.
+    After `reset` and when a search ends, `info` has the values of the single environment; the masks `_drive_s` and so
+    on say for which searches.
 
     ## Arguments
     - `num_envs`: number of environments.
@@ -167,7 +167,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.reward_scale = float(reward_scale)
         self.action_space = batch_space(self.single_action_space, n)
         self.observation_space = batch_space(self.single_observation_space, n)
-        self._names = np.array([scenario.name for scenario in self.scenarios])
         over = np.zeros((2, n), np.bool_)
         self._steps = Steps(np.zeros(n), over[0], over[1], self._seen["action_mask"])
         self._limit = max_episode_steps or np.iinfo(np.int64).max
@@ -264,7 +263,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._arrive(which)
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
         self._done = self._done & ~which
-        return self._observations(), {"scenario": self._names[self.scenario_index], "_scenario": which}
+        return self._observations(), self._metrics(which.copy())
 
     def close_extras(self, **kwargs: Any) -> None:
         del kwargs
@@ -376,7 +375,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         costs = words[len(METRICS) :].view(np.float64)
         terms = zip(REWARD_TERMS, np.multiply(costs, -self.reward_scale, out=costs), strict=True)
         metrics["reward_terms"] = dict(terms) | dict.fromkeys(_WHICH_TERMS, done)
-        metrics["scenario"] = self._names[self.scenario_index]
+        metrics["scenario_index"] = self.scenario_index
         return metrics | dict.fromkeys(_WHICH, done)
 
 

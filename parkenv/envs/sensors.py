@@ -77,14 +77,15 @@ class SearchSensorsEnv(SensingSearchEnv):
     | `count` | `Discrete(K + 1)` | number of captures of the last step; 0 after parking |
     | `pose` | `Box(-1e7, 1e7, (K, 3), float32)` | x, y in m, yaw in rad of the vehicle, lot frame |
     | `captured_at` | `Box(0, 1e8, (K,), float32)` | s since the search began |
-    | `image.<camera>` | `Box(0, 255, (K, h, w, 3), uint8)` | RGB, for each camera of the rig |
-    | `image.<pair>` | `Box(0, 255, (K, 2, h, w, 3), uint8)` | RGB, left and right, for each stereo camera |
-    | `scan.<laser>` | `Box(0, max_range, (K, n_beams), float32)` | m; `max_range` for no return |
+    | `image_<camera>` | `Box(0, 255, (K, h, w, 3), uint8)` | RGB, for each camera of the rig |
+    | `image_<pair>` | `Box(0, 255, (K, 2, h, w, 3), uint8)` | RGB, left and right, for each stereo camera |
+    | `scan_<laser>` | `Box(0, max_range, (K, n_beams), float32)` | m; `max_range` for no return |
 
     With `observation="scan"` there are no images, and a step takes a fraction of a millisecond instead of dozens.
 
     Beam n points along -3π/4 + n·0.25° from forward, counter-clockwise, in the laser's frame. `env.unwrapped.rig` has
-    the poses and models of the sensors. The thesis's rig has `image.right` and `scan.laser`.
+    the poses and models of the sensors. The thesis's rig has `image_right` and `scan_laser`; a dot in a
+    sensor's name becomes an underscore.
 
     ## Rewards
     Minus the seconds of the step, as in `parkenv/Search-v2`.
@@ -112,13 +113,14 @@ road users |
     >>> import parkenv
     >>> env = gym.make("parkenv/SearchSensors-v2", scenario="mini", captures=2)
     >>> observation, info = env.reset(seed=0)
-    >>> observation["image.right"].shape, observation["scan.laser"].shape, int(observation["count"])
+    >>> observation["image_right"].shape, observation["scan_laser"].shape, int(observation["count"])
     ((2, 300, 400, 3), (2, 1081), 1)
 
     ```
 
     ## Version history
-    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast; pictures are
+    - v2: keys without dots, as networks of PyTorch want (`image.right` became `image_right`, with equal values);
+      observations gain `day_error`; packaged scenarios have days that differ from their forecast; pictures are
       400 px wide by default.
     - v1: same version number as `parkenv/Search-v2`.
     - v0: first version.
@@ -154,12 +156,14 @@ road users |
         seen["pose"] = spaces.Box(-FARTHEST, FARTHEST, (k, 3), np.float32)
         seen["captured_at"] = spaces.Box(0.0, LATEST, (k,), np.float32)
         for name, camera, _ in self.rig.cameras:
-            seen[f"image.{name}"] = spaces.Box(0, 255, (k, camera.height, camera.width, 3), np.uint8)
+            seen[sensor_key("image", name)] = spaces.Box(
+                0, 255, (k, camera.height, camera.width, 3), np.uint8
+            )
         for name, stereo, _ in self.rig.stereo_cameras:
             size = (stereo.camera.height, stereo.camera.width)
-            seen[f"image.{name}"] = spaces.Box(0, 255, (k, 2, *size, 3), np.uint8)
+            seen[sensor_key("image", name)] = spaces.Box(0, 255, (k, 2, *size, 3), np.uint8)
         for name, laser, _ in self.rig.lasers:
-            seen[f"scan.{name}"] = spaces.Box(0.0, laser.max_range, (k, laser.n_beams), np.float32)
+            seen[sensor_key("scan", name)] = spaces.Box(0.0, laser.max_range, (k, laser.n_beams), np.float32)
         self.observation_space = spaces.Dict(seen)
 
     def _observation(self, vertex: int) -> dict[str, Any]:
@@ -176,15 +180,20 @@ road users |
             observation["pose"][i] = capture.pose
             observation["captured_at"][i] = time - state.arrival.time
             for name, frame in capture.images.items():
-                observation[f"image.{name}"][i] = frame.image
+                observation[sensor_key("image", name)][i] = frame.image
             for name, pair in capture.pairs.items():
-                observation[f"image.{name}"][i] = pair.left.image, pair.right.image
+                observation[sensor_key("image", name)][i] = pair.left.image, pair.right.image
             for name, laser, _ in self.rig.lasers:
-                observation[f"scan.{name}"][i] = np.minimum(capture.scans[name], laser.max_range)
+                observation[sensor_key("scan", name)][i] = np.minimum(capture.scans[name], laser.max_range)
         return observation
 
     def _newest(self) -> TimedCapture | None:
         return self._captures[-1] if self._captures else None
+
+
+def sensor_key(kind: str, name: str) -> str:
+    """Return the key of a sensor's data, without dots, which names of PyTorch's modules cannot have."""
+    return f"{kind}_{name}".replace(".", "_")
 
 
 def with_camera_images(

@@ -183,7 +183,7 @@ class UsualAgent(TargetAgent):
 
 
 class RandomAgent(SearchAgent[np.random.Generator]):
-    """`random`: chooses any available action, all with equal probability.
+    """`random`: chooses any available action, all with equal probability; waits at a dead end.
 
     The `seed`, the time of arrival and the entry determine the actions.
     """
@@ -199,4 +199,5 @@ class RandomAgent(SearchAgent[np.random.Generator]):
         return np.random.default_rng([self.seed, moment, int(observation["vertex"])])
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: np.random.Generator) -> int:
-        return int(memory.choice(np.flatnonzero(observation["action_mask"])))
+        available = np.flatnonzero(observation["action_mask"])
+        return int(memory.choice(available)) if available.size else self.wait(int(observation["vertex"]))

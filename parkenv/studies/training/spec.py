@@ -221,13 +221,13 @@ class TrainingSpec(Study):
             yield Stage(self.doing, self, [Cell(work, seeds)])
 
     def run(self, work: _Seeds, items: Sequence[int]) -> list[Row]:
-        from parkenv.studies.training.training import MODEL, use_one_thread
+        from parkenv.studies.training.training import MODEL, own_thread_and_seeds
 
-        use_one_thread()
         rows: list[Row] = []
         for seed in items:
             folder = work.folder / f"seed_{seed}"
-            last = self.training.train(seed, folder, work.shown, work.command)[-1]
+            with own_thread_and_seeds():
+                last = self.training.train(seed, folder, work.shown, work.command)[-1]
             # As bytes, so that a worker on another machine can return them.
             files = {name: (folder / name).read_bytes() for name in (CURVE, MODEL)}
             rows.append({"seed": seed, "steps": int(last["steps"]), "wall_s": last["wall_s"], FILES: files})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import random
 import threading
 import time
 import zipfile
@@ -321,11 +322,12 @@ class Training:
 
     def test(self, model: Path) -> list[Row]:
         """Test a model; return a row for each test."""
-        policy = LearnedAgent(self.sides[0][0], self.spec.algorithm, model).model
-        return [
-            {"test_scenario": name, **times_row(*episode_times(policy, places, self.test_seeds))}
-            for name, places in self.tests.items()
-        ]
+        with own_thread_and_seeds():
+            policy = LearnedAgent(self.sides[0][0], self.spec.algorithm, model).model
+            return [
+                {"test_scenario": name, **times_row(*episode_times(policy, places, self.test_seeds))}
+                for name, places in self.tests.items()
+            ]
 
     def replays(self, summary: Row, folder: Path, options: ReportOptions) -> Sequence[ReplayJob]:
         """Return the tests of the best model and of the best planners; nothing without a test."""
@@ -448,13 +450,26 @@ def episode_times(model: Any, places: Scenario | Sequence[Scenario], seeds: Sequ
     return times, parked
 
 
-def use_one_thread() -> None:
-    """Let this process train on a single thread, so that one training per core can run in parallel."""
+@contextmanager
+def own_thread_and_seeds() -> Iterator[None]:
+    """Train on a single thread, so that one training per core can run in parallel; put global settings back.
+
+    stable-baselines3 seeds the generators of Python, NumPy and PyTorch.
+    """
     from numba import get_num_threads
 
+    threads = torch.get_num_threads()
+    states = random.getstate(), np.random.get_state()  # noqa: NPY002 - what others use
     # Starting numba's threads sets the number of OpenMP's, which PyTorch has, too.
     get_num_threads()
     torch.set_num_threads(1)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        torch.set_num_threads(threads)
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
 
 
 def save_checkpoint(path: Path, model: Any) -> None:

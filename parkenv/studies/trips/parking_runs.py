@@ -95,8 +95,8 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         "way": task.way if task.kind != "parallel" else "",
         "slot": task.slot_id,
         "parked": bool(info["is_success"]),
-        "reason": info["contact"] or ("" if info["is_success"] else "out of time"),
-        "contact": info["contact"],
+        "reason": state.contact or ("" if info["is_success"] else "out of time"),
+        "contact": state.contact,
         **{k: info[k] for k in ("time_s", "driven_m", "direction_changes", "position_error_m")},
         "angle_error_deg": float(np.degrees(info["angle_error_rad"])),
         "wheel_rad": float(np.abs(np.diff(wheel)).sum()),
@@ -113,7 +113,7 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
             "expansions": sum(p.expansions for p in memory.paths),
             "margin_m": first.margin if first else np.nan,
         }
-        if not row["parked"] and not info["contact"] and memory.reason:
+        if not row["parked"] and not state.contact and memory.reason:
             row["reason"] = memory.reason
     return Parking(row, state, film[0].frames if film else [])
 
