@@ -23,16 +23,17 @@ from parkenv.errors import InputError, needs_extra, require
 from parkenv.version import __version__
 from sim_sensors.errors import SensorError
 
-START, AGENTS, CROWDS, SENSE, DRIVE, DATA = (
-    "Start here", "Agents", "Many drivers", "Sensors and maps", "Manoeuvres", "Lots, logs and files",
+# Headings by what the reader brings; the first has what a newcomer needs.
+START, AGENTS, PLACES, SENSE = (
+    "Start here", "Planners and learners", "Places, counts and drivers", "Cameras, lasers and maps",
 )  # fmt: skip
 COMMANDS = {
     "demo": Entry("Survey a lot with simulated sensors, then search in it.", "demo", START),
     "compare": Entry("Compare agents in the same worlds.", "compare", START),
+    "train": Entry("Train agents by reinforcement learning.", "train", START),
     "play": Entry("Play the search yourself, in the worlds of the agents.", "report:Play", START),
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", START),
     "run": Entry("Run an experiment file.", "study_command:Run", START),
-    "train": Entry("Train agents by reinforcement learning.", "train", AGENTS),
     "plan": Entry(
         "Draw planned searches, as in Fig. 4.9 to 4.12 of the thesis.", "study_commands:Plan", AGENTS
     ),
@@ -41,21 +42,9 @@ COMMANDS = {
     "benchmark check": Entry("Check results of the suite, and print them side by side.", "benchmark:Check"),
     "benchmark page": Entry("Check results of the suite, and write a page of them.", "benchmark:Page"),
     "benchmark show": Entry("Show the tasks and settings of the suite.", "benchmark:Show"),
-    "commute": Entry("Simulate daily commuters with a map that learns.", "commute", CROWDS),
-    "fleet": Entry("Simulate many cars that search at the same time.", "fleet", CROWDS),
-    "curve": Entry("Fit search time and walk as functions of occupancy.", "curve", CROWDS),
-    "survey": Entry("Drive past every slot, and map which are taken.", "survey", SENSE),
-    "map": Entry("Show the predictions of a map.", "sensing:Map", SENSE),
-    "map-drive": Entry("Make a map from a recorded drive, photographs or a film.", "sensing:MapDrive", SENSE),
-    "sensors": Entry("Preview the simulated sensors.", heading=SENSE),
-    "sensors preview": Entry("Draw the sensor measurements on the way to the best slot.", "sensing:Preview"),
-    "fit-sensor-model": Entry("Measure how often slots are seen right.", "sensing:FitSensorModel", SENSE),
-    "detect": Entry("Find cars in photographs, videos and recorded drives.", "detect:Detect", SENSE),
-    "train-detector": Entry("Train a car model on photographs.", "detect:TrainDetector", SENSE),
-    "evaluate-detector": Entry("Measure a detector on labelled images.", "detect:EvaluateDetector", SENSE),
-    "park": Entry("Evaluate agents that drive the car into a slot.", "park", DRIVE),
-    "calibrate": Entry("Measure the costs of searches on whole driven trips.", "calibrate", DRIVE),
-    "lot": Entry("Show, check, import, count and convert lots.", heading=DATA),
+    "park": Entry("Evaluate agents that drive the car into a slot.", "park", AGENTS),
+    "calibrate": Entry("Measure the costs of searches on whole driven trips.", "calibrate", AGENTS),
+    "lot": Entry("Show, check, import, count and convert lots.", heading=PLACES),
     "lot show": Entry("Draw a lot and summarise it.", "lot:Show"),
     "lot check": Entry(
         "List all errors and warnings of a lot file, by feature number (from 0).", "lot:Check"
@@ -63,14 +52,26 @@ COMMANDS = {
     "lot import": Entry("Import a real place; report what was found, guessed and left out.", "lot:Import"),
     "lot census": Entry("Describe lots: size, kinds of slots, distances, error probability.", "lot:Census"),
     "lot convert": Entry("Write a lot as native GeoJSON.", "lot:Convert"),
-    "occupancy": Entry("Fit models to recorded occupancy, and score forecasts.", heading=DATA),
+    "occupancy": Entry("Fit models to recorded occupancy, and score forecasts.", heading=PLACES),
     "occupancy fit": Entry("Fit a model to recorded occupancy by maximum likelihood.", "occupancy:Fit"),
     "occupancy demand": Entry("Fit the demand of a town to counts of its car parks.", "demand"),
     "occupancy evaluate": Entry("Score forecasts of occupancy against simple ones.", "occupancy:Evaluate"),
     "occupancy record": Entry("Record days of a town's own demand as a log.", "occupancy:Record"),
+    "fleet": Entry("Simulate many cars that search at the same time.", "fleet", PLACES),
+    "commute": Entry("Simulate daily commuters with a map that learns.", "commute", PLACES),
+    "curve": Entry("Fit search time and walk as functions of occupancy.", "curve", PLACES),
     "schema": Entry(
-        "Print the JSON schema of a kind of file, or write all schemas.", "study_command:Schema", DATA
+        "Print the JSON schema of a kind of file, or write all schemas.", "study_command:Schema", PLACES
     ),
+    "map-drive": Entry("Make a map from a recorded drive, photographs or a film.", "sensing:MapDrive", SENSE),
+    "detect": Entry("Find cars in photographs, videos and recorded drives.", "detect:Detect", SENSE),
+    "survey": Entry("Drive past every slot, and map which are taken.", "survey", SENSE),
+    "map": Entry("Show the predictions of a map.", "sensing:Map", SENSE),
+    "sensors": Entry("Preview the simulated sensors.", heading=SENSE),
+    "sensors preview": Entry("Draw the sensor measurements on the way to the best slot.", "sensing:Preview"),
+    "fit-sensor-model": Entry("Measure how often slots are seen right.", "sensing:FitSensorModel", SENSE),
+    "train-detector": Entry("Train a car model on photographs.", "detect:TrainDetector", SENSE),
+    "evaluate-detector": Entry("Measure a detector on labelled images.", "detect:EvaluateDetector", SENSE),
 }
 app = make_app(
     "Search for a free parking space: worlds, planners, and comparisons between them.",
