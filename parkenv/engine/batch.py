@@ -7,9 +7,7 @@ So while one search is stepped with its local observation, the data of the next 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import Any, NamedTuple
-from weakref import ReferenceType, ref
 
 import numpy as np
 from gymnasium import spaces
@@ -29,15 +27,13 @@ from parkenv.engine.kernel import (
 )
 from parkenv.engine.local_observation import Surroundings, local_space, observe_surroundings
 from parkenv.engine.records import N_ACTIONS, SEARCH, SENTINEL, edge_at, scenario_at, search_at
-from parkenv.engine.search_belief import refresh_belief, write_belief
+from parkenv.engine.search_belief import refresh_belief
 from parkenv.engine.searches import ScenarioRecords, Searches
 from parkenv.engine.spaces import space_of
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, inlined, kernel, prefetch_forecast
 from parkenv.world.scenario import EDGE
 
 _APART = 2  # searches between two stages of loading
-_NEVER = -1
-_MOST_KEPT = 3  # beliefs, of which callers rarely hold on to more than the last two
 _SEARCH_BYTES, _EDGE_BYTES = SEARCH.itemsize, EDGE.itemsize
 
 
@@ -75,11 +71,25 @@ class Observer(ABC):
     ) -> None:
         most_observed = None if "step_observed" in kept else 0
         self.searches, self.space = Searches(tables, n, full_belief, most_observed), space
-        self.address = self.searches.address
         own: Any = create_empty_array(spaces.Dict({k: v for k, v in space.items() if k not in kept}), n)
-        of_searches = {name: getattr(self.searches, name).reshape(n, -1) for name in kept}
-        self.seen: dict[str, NDArray[Any]] = own | of_searches
+        self._own, self._kept = own, kept
         self.n_bytes: int = self.searches.n_bytes + sum(array.nbytes for array in own.values())
+        self._find_arrays()
+
+    def _find_arrays(self) -> None:
+        searches = self.searches
+        of_searches = {
+            name: getattr(searches, name).reshape(len(searches.records), -1) for name in self._kept
+        }
+        self.seen: dict[str, NDArray[Any]] = self._own | of_searches
+        self.address = searches.address
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("seen", "address")}
+
+    def __setstate__(self, content: dict[str, Any]) -> None:
+        vars(self).update(content)
+        self._find_arrays()
 
     @abstractmethod
     def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
@@ -93,89 +103,18 @@ class Observer(ABC):
             steps: results to write.
         """
 
-    def renew(self) -> None:
-        return
-
     def observations(self) -> dict[str, NDArray[Any]]:
-        """Return the observations for a caller who may keep them, if `renew` is called before the next step."""
         return {name: array.copy() for name, array in self.seen.items()}
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
-        return tuple(array.view(np.uint8) if array.dtype.names else array for array in self.searches.save())
+        saved = tuple(array.view(np.uint8) if array.dtype.names else array for array in self.searches.save())
+        return (*saved, *(array.copy() for array in self._own.values()))
 
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        self.searches.restore(state)
-
-
-class _Beliefs:
-    """Memory of arrays of `Searches`, by name: what callers got of it, and the last step that wrote to it."""
-
-    def __init__(self, like: Mapping[str, NDArray[np.float32]]) -> None:
-        # No array of numpy's: a view would refer to it instead of the array that the caller got.
-        self._memory = {name: bytearray(array.nbytes) for name, array in like.items()}
-        self.arrays = {name: self._view(name, array.shape) for name, array in like.items()}
-        for name, array in like.items():
-            self.arrays[name][...] = array
-        self.handed_out: list[ReferenceType[NDArray[Any]]] = []
-        self.step = _NEVER
-
-    def _view(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        return np.ndarray(shape, np.float32, self._memory[name])
-
-    def are_free(self) -> bool:
-        return all(array() is None for array in self.handed_out)
-
-    def hand_out(self, name: str) -> NDArray[np.float32]:
-        handed = self._view(name, (len(self.arrays[name]), self.arrays[name][0].size))
-        self.handed_out.append(ref(handed))
-        return handed
-
-
-class BeliefMemory:
-    """The memory of `p_occupied` and `belief` of some searches: what callers still hold of it stays as it is.
-
-    A step changes the belief in few slots, so copying the beliefs of all searches would take a third of its time.
-    """
-
-    def __init__(self, searches: Searches) -> None:
-        self._searches = searches
-        self._now = _Beliefs({"p_occupied": searches.p_occupied, "belief": searches.belief})
-        searches.hold(**self._now.arrays)
-        self._kept = [self._now]
-        self._begun_in: IntArray = np.zeros(len(searches.records), np.int64)  # the step
-        self._step = 0
-
-    def begin(self, which: BoolArray) -> None:
-        np.copyto(self._begun_in, self._step, where=which)
-
-    def renew(self) -> bool:
-        self._now.step = self._step
-        self._step += 1
-        if self._now.are_free():
-            self._now.handed_out = []
-            return False
-        last, self._now = self._now, self._free()
-        self._searches.hold(**self._now.arrays)
-        begun = np.flatnonzero(self._begun_in > self._now.step)
-        for name, array in self._now.arrays.items():
-            array[begun] = last.arrays[name][begun]
-        return True
-
-    def forget(self) -> None:
-        self._kept = [self._now]
-
-    def hand_out(self, name: str) -> NDArray[Any]:
-        """Return the array of this name, (n, ...), which nobody changes while it, or a part of it, is held."""
-        return self._now.hand_out(name)
-
-    def _free(self) -> _Beliefs:
-        for beliefs in self._kept:
-            if beliefs.are_free():
-                beliefs.handed_out = []
-                return beliefs
-        new = _Beliefs(self._now.arrays)
-        self._kept = [*self._kept[1 - _MOST_KEPT :], new]
-        return new
+        n = len(state) - len(self._own)
+        self.searches.restore(state[:n])
+        for own, array in zip(self._own.values(), state[n:], strict=True):
+            own[...] = array
 
 
 class BeliefObserver(Observer):
@@ -185,33 +124,10 @@ class BeliefObserver(Observer):
         space = {k: v for k, v in space_of(tables.scenarios).items() if k not in without}
         kept = tuple(name for name in ("p_occupied", "belief", "step_observed", "day_error") if name in space)
         super().__init__(tables, n, spaces.Dict(space), full_belief=True, kept=kept)
-        self._memory, self._moved = BeliefMemory(self.searches), False
-        self._beliefs = tuple(name for name in ("p_occupied", "belief") if name in space)
-        self._find_beliefs()
-
-    def _find_beliefs(self) -> None:
-        for name in self._beliefs:
-            self.seen[name] = getattr(self.searches, name).reshape(len(self.searches.records), -1)
-
-    def renew(self) -> None:
-        if self._memory.renew():
-            self._moved = True
-            self._find_beliefs()
-
-    def observations(self) -> dict[str, NDArray[Any]]:
-        hand_out, beliefs = self._memory.hand_out, self._beliefs
-        return {name: hand_out(name) if name in beliefs else seen.copy() for name, seen in self.seen.items()}
-
-    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        self.renew()
-        super().set_state(state)
-        self._memory.forget()
 
     def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
-        self._memory.begin(fresh)
         vertex, time = self.seen["vertex"], self.seen["time"]
-        step_with_belief(self.address, self._moved, actions, fresh, idle, limit, steps, vertex, time)
-        self._moved = False
+        step_with_belief(self.address, actions, fresh, idle, limit, steps, vertex, time)
 
 
 class LocalObserver(Observer):
@@ -268,7 +184,6 @@ def advance(search: Any, e: int, action: int, fresh: bool, limit: int, steps: St
 @kernel
 def step_with_belief(
     address: int,
-    moved: bool,
     actions: IntArray,
     fresh: BoolArray,
     idle: BoolArray,
@@ -277,13 +192,11 @@ def step_with_belief(
     vertex: IntArray,
     time: NDArray[np.float32],
 ) -> None:
-    """Step, update the full belief, and write vertex and time; `moved` if the beliefs stand in other memory."""
+    """Step, update the full belief, and write vertex and time."""
     for e in range(len(actions)):
-        search = search_at(address, e)
-        if moved:
-            write_belief(search)
         if idle[e]:
             continue
+        search = search_at(address, e)
         advance(search, e, actions[e], fresh[e], limit, steps)
         if fresh[e]:
             init_prior(search)

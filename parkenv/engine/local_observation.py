@@ -116,6 +116,9 @@ class Surroundings(NamedTuple):
     def n_bytes(self) -> int:
         return sum(array.nbytes for array in self)
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Surroundings:
+        return self._replace(columns=self.columns.copy())  # the rest never changes
+
     @classmethod
     def of(cls, problems: Sequence[SearchProblem], k: int) -> Surroundings:
         """Compute the surroundings of all vertices, with k slots nearby and k ahead of each move.

@@ -12,7 +12,7 @@ its posterior, and the slots given the day. On request, days may also be unlike 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -127,6 +127,8 @@ class Simulations:
         self.searches = Searches(tables, n, False, most_observed_in(tables.scenarios))
         self._costs, self._over = np.zeros(n), np.zeros(n, np.bool_)
 
+    __copy__ = deepcopy
+
     def __len__(self) -> int:
         return len(self.searches.records)
 
@@ -156,7 +158,7 @@ class Simulations:
     def one(self, i: int) -> Simulations:
         """Return search i by itself, not a copy: its steps are those of search i, and take a tenth of `Model.step`."""
         require_whole("i", i, most=len(self) - 1)
-        alone = copy(self)
+        alone = object.__new__(Simulations)
         alone.searches = self.searches.row(i)
         alone._costs, alone._over = np.zeros(1), np.zeros(1, np.bool_)
         return alone
@@ -342,7 +344,7 @@ class Model:
         tables = of._tables if isinstance(of, Belief) else of.searches.scenarios
         lot, other = self.problem.lot, tables.scenarios[0].lot
         require(
-            other is lot,
+            other is lot or other == lot,
             f"{name} is of lot {other.name!r} with {other.n_slots} slots, want {lot.name!r} with {lot.n_slots}",
         )
 

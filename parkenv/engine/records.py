@@ -128,6 +128,10 @@ _EPISODES = [
 
 PROGRESS_FIELDS = tuple(str(entry[0]) for entry in _PROGRESS + _EPISODES)
 """Fields of a SEARCH record that a search changes."""
+OPTION_FIELDS = (
+    "n_scenarios", "chosen_scenario", "chosen_entry", "chosen_day", "chosen_second", "car", "reserved", "walks",
+)  # fmt: skip
+"""Its further fields, besides sizes and addresses."""
 
 
 def _with_costs(fields: Sequence[Any], **arrays: str) -> np.dtype[Any]:

@@ -136,22 +136,6 @@ def refresh_belief(search: Any) -> None:
                 p_occupied[slot_at(search.slots, first + i).slot] = block.p_occupied[i]
 
 
-@kernel
-def write_belief(search: Any) -> None:
-    """Write the belief in all slots with a column, as of the last step, to memory that may hold an older one."""
-    width, slots, blocks, arrival = search.width, search.slots, search.blocks, search.arrival
-    p_occupied, belief = float32s(search.p_occupied), float32s(search.belief)
-    for column in range(1, search.n_columns + 1):
-        slot, i = slot_at(slots, column).slot, column & (BLOCK_SIZE - 1)
-        block = block_at(blocks, column >> BLOCK_BITS)
-        p_occupied[slot] = block.p_occupied[i]
-        belief[FORECAST * width + slot], belief[P_OBSERVED * width + slot] = (
-            block.prior[i],
-            block.p_observed[i],
-        )
-        belief[OBSERVED_AT * width + slot] = block.observed_at[i] - arrival
-
-
 @inlined
 def end_observed(search: Any) -> None:
     if search.step_observed != 0:

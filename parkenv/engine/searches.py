@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import copy
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.compiled.arrays import Float32Array, IntArray
+from parkenv.compiled.arrays import IntArray
 from parkenv.compiled.keyed_random import episode_key
 from parkenv.compiled.memory import address_of, in_one_block, sparse_zeros, zeros_on_lines
 from parkenv.engine.records import (
@@ -22,6 +21,7 @@ from parkenv.engine.records import (
     HIDDEN_FIELDS,
     NEVER_OBSERVED,
     OBSERVED_AT,
+    OPTION_FIELDS,
     P_OBSERVED,
     PROBLEM_FIELDS,
     PROGRESS_FIELDS,
@@ -31,7 +31,7 @@ from parkenv.engine.records import (
     UNGUIDED,
     Value,
 )
-from parkenv.errors import InputError, require_number, require_one_of, require_whole
+from parkenv.errors import InputError, require, require_number, require_one_of, require_whole
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, LOG_KIND, PROCESS_KIND, RECORDED_DAY
 from parkenv.world.occupancy.process import Arrival, CompiledModel, PriorModel, World
@@ -75,6 +75,13 @@ class ScenarioRecords:
             of_model = _arrays_in([model.record, *model.tables.values(), *model.kept])
             arrays |= {id(array): array for array in of_model}
         self.n_bytes = self.records.nbytes + sum(array.nbytes for array in arrays.values())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and pickles make records of their own: these hold addresses."""
+        return ScenarioRecords, (self.scenarios,)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ScenarioRecords:
+        return self  # nothing changes
 
     def _join(self) -> None:
         of_models = [array for model in self._models for array in model.tables.values()]
@@ -205,11 +212,6 @@ class Searches:
         first = address_of(array, array.dtype)
         self.records[name] = first + np.arange(len(self.records)) * array.strides[0] if len(array) else 0
 
-    def hold(self, p_occupied: Float32Array, belief: Float32Array) -> None:
-        self.p_occupied, self.belief = p_occupied, belief
-        self._write_addresses("p_occupied", p_occupied)
-        self._write_addresses("belief", belief)
-
     def copiers(self, search: int) -> tuple[Callable[[], NDArray[Any]], ...]:
         """Return what copies a search's `clock`, `p_occupied`, `belief`, `step_observed` and `day_error`; flat arrays.
 
@@ -261,7 +263,8 @@ class Searches:
         return sum(array.nbytes for array in (self.records, *self._arrays().values()))
 
     def row(self, i: int) -> Searches:
-        single, rows = copy(self), slice(i, i + 1)
+        single, rows = object.__new__(Searches), slice(i, i + 1)
+        vars(single).update(vars(self))
         single.records = self.records[rows]
         for name in _ARRAYS:
             setattr(single, name, getattr(self, name)[rows])
@@ -272,13 +275,14 @@ class Searches:
         parts = (self.records, *self._arrays().values())
         return tuple(array[rows] if len(array) else array.copy() for array in parts)
 
-    def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
+    def restore(self, saved: tuple[NDArray[Any], ...], fields: Sequence[str] = PROGRESS_FIELDS) -> None:
         records, *arrays = saved
-        records = records.view(SEARCH)
-        width = int(records["width"][0])
-        if width != self.records["width"][0]:
-            raise InputError(f"state is of a lot with {width} slots, this one has {self.records['width'][0]}")
-        for name in PROGRESS_FIELDS:
+        records, n = records.view(SEARCH), len(self.records)
+        require(len(records) == n, f"state is of {len(records)} searches, want {n}")
+        widths, own_widths = records["width"], self.records["width"]
+        if (widths != own_widths).any():
+            raise InputError(f"state is of a lot with {widths[0]} slots, this one has {own_widths[0]}")
+        for name in fields:
             self.records[name] = records[name]
         if not (
             (self.records["scenario_index"] >= 0)
@@ -289,8 +293,16 @@ class Searches:
         for own, array in zip(self._arrays().values(), arrays, strict=True):
             own[...] = array.view(own.dtype)
         if self.needs_python:
-            for search in range(len(self.records)):
-                self._make_world(search)
+            for search in np.flatnonzero(self.records["key"]):  # the others have not begun
+                self._make_world(int(search))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and pickles have arrays of their own: records hold addresses."""
+        most_observed, full_belief = self.step_observed.shape[2], len(self.p_occupied) > 0
+        return Searches, (self.scenarios, len(self.records), full_belief, most_observed), self.save()
+
+    def __setstate__(self, saved: tuple[NDArray[Any], ...]) -> None:
+        self.restore(saved, (*PROGRESS_FIELDS, *OPTION_FIELDS))
 
 
 def most_observed_in(problems: Sequence[SearchProblem]) -> int:

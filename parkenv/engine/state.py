@@ -31,6 +31,10 @@ class SearchState:
         self.path: list[int] = []
         self._world: tuple[np.uint64, World] | None = None
 
+    def __setstate__(self, content: dict[str, Any]) -> None:
+        vars(self).update(content)
+        self._record = self._searches.records[self._index]
+
     @property
     def scenario(self) -> Scenario:
         return self._searches.scenario_of(self._index)

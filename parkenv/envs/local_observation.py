@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -33,6 +34,8 @@ class LocalObservation(
         >>> observation["local"].shape
         (86,)
     """
+
+    __copy__ = deepcopy
 
     def __init__(self, env: gym.Env[Any, Any], k: int = 5) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, k=k)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
     """
 
     actions: NDArray[Any]
+    __copy__ = deepcopy
 
     def __init__(self, batch: VectorEnv[Any, Any, Any], reward_scale: float = 1.0) -> None:
         if batch.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
@@ -36,7 +38,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self.batch: Any = batch
         self.reward_scale = reward_scale
         self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.int64)
-        self._masks: NDArray[Any] = np.zeros((self.num_envs, 0), dtype=np.int8)
+        self._masks: NDArray[Any] = np.zeros((self.num_envs, 0), np.bool_)
 
     def reset(self) -> dict[str, NDArray[Any]]:
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
@@ -45,8 +47,11 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._returns[:], self._lengths[:] = 0.0, 0
-        self._masks = observations.get("action_mask", self._masks)
+        self._keep_masks(observations)
         return dict(observations)
+
+    def _keep_masks(self, observations: Any) -> None:
+        self._masks = np.array(observations.get("action_mask", self._masks), np.bool_)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self.actions = np.asarray(actions)
@@ -55,7 +60,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self,
     ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         observations, rewards, terminated, truncated, info = self.batch.step(self.actions)
-        self._masks = observations.get("action_mask", self._masks)
+        self._keep_masks(observations)
         self._returns += rewards
         self._lengths += 1
         done = terminated | truncated
@@ -75,7 +80,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         return observations, (rewards * self.reward_scale).astype(np.float32), done, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
-        return self._masks.astype(np.bool_)
+        return self._masks.copy()
 
     def close(self) -> None:
         """Do nothing: there are no resources to release."""

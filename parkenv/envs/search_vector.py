@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -160,23 +162,38 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.metadata = self.metadata | {"autoreset_mode": mode}
         self._tables = ScenarioRecords(self.scenarios)
         self.observer = observer(self._tables, n)
-        self._searches, self._seen = self.observer.searches, self.observer.seen
         self.single_action_space = spaces.Discrete(N_ACTIONS)
         self._flat = FlatLayout(self.observer.space) if flat else None
         self.single_observation_space = self.observer.space if self._flat is None else self._flat.space
         self.reward_scale = float(reward_scale)
         self.action_space = batch_space(self.single_action_space, n)
         self.observation_space = batch_space(self.single_observation_space, n)
-        over = np.zeros((2, n), np.bool_)
-        self._steps = Steps(np.zeros(n), over[0], over[1], self._seen["action_mask"])
         self._limit = max_episode_steps or np.iinfo(np.int64).max
         self._mode, self._copy = mode, copy
         self._begun = False
         self.render_mode = render_mode
-        self._states = [SearchState(self._searches, i) for i in range(n)] if render_mode else []
+        self._states: list[SearchState] = []
         self._renderers: dict[str, SearchRenderer] = {}
         self._nobody = np.zeros(n, dtype=np.bool_)
         self._done = self._nobody
+        self._find_arrays()
+        if render_mode:
+            self._states = [SearchState(self._searches, i) for i in range(n)]
+
+    def _find_arrays(self) -> None:
+        self._searches, self._seen = self.observer.searches, self.observer.seen
+        over = np.zeros((2, self.num_envs), np.bool_)
+        self._steps = Steps(np.zeros(self.num_envs), over[0], over[1], self._seen["action_mask"])
+
+    __copy__ = deepcopy
+
+    def __getstate__(self) -> dict[str, Any]:
+        rebuilt = "_searches", "_seen", "_steps"
+        return {name: value for name, value in vars(self).items() if name not in rebuilt}
+
+    def __setstate__(self, content: dict[str, Any]) -> None:
+        vars(self).update(content)
+        self._find_arrays()
 
     @property
     def reward_terms(self) -> dict[str, FloatArray]:
@@ -258,8 +275,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             if starts:
                 choose_start(self._searches, int(i), int(records[i]["episode"]) + 1, starts)
         self._begun = True
-        if self._copy:
-            self.observer.renew()
         self._arrive(which)
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
         self._done = self._done & ~which
@@ -270,15 +285,16 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._begun = False
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
-        return self.observer.get_state()
+        return (*self.observer.get_state(), self._done.copy())
 
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        """Continue from a state that `get_state` returned for the same scenarios; no search in it may be over.
+        """Continue from a state that `get_state` returned for the same scenarios and options.
 
         The worlds are part of it: what follows is the true future once more.
         """
-        self.observer.set_state(state)
-        self._begun, self._done = True, self._nobody
+        *of_observer, done = state
+        self.observer.set_state(tuple(of_observer))
+        self._begun, self._done = True, done.copy()
         for search in self._states:
             search.path = [search.vertex]
 
@@ -298,8 +314,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             raise InputError(
                 f"actions[{wrong}] is {actions[wrong]}, want a number from 0 to {PARK} ({', '.join(ACTIONS)})"
             )
-        if self._copy:
-            self.observer.renew()
         fresh = self._nobody
         if self._mode is AutoresetMode.NEXT_STEP:
             fresh = self._done
@@ -383,7 +397,7 @@ def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int
     if observation == "full":
         return BeliefObserver
     if observation == "occupancy":
-        return lambda tables, n: BeliefObserver(tables, n, without=BELIEF_PARTS)
+        return partial(BeliefObserver, without=BELIEF_PARTS)
     if observation == "local":
-        return lambda tables, n: LocalObserver(tables, n, NEAR_SLOTS if k is None else k)
+        return partial(LocalObserver, k=NEAR_SLOTS if k is None else k)
     raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")

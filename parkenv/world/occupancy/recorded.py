@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -128,6 +128,10 @@ class RecordedWorld(World):
         self._occupancy = occupancy  # keeps the record's arrays alive
         self._day = occupancy.day_records([arrival.day], forecast=False)
         self._midnight = float(self._day["midnight"][0])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and pickles make a record of their own: it holds addresses."""
+        return RecordedWorld, (self._occupancy, self.arrival)
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
         return self._query(slots, time)[0]

@@ -1,0 +1,188 @@
+"""Copies, pickles, saved states and changed results of all kinds of environments, batches and simulated searches."""
+
+import copy
+import os
+import pickle
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from test_search_vector import recorded_scenario
+
+import parkenv
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.lots.generators import grid_lot
+
+DRIVEN = (3, 3, 1, 3, 0, 2)
+
+
+def parts(result):
+    """Return all numbers and texts of a result, in order."""
+    if isinstance(result, dict):
+        return [part for name in sorted(result) for part in parts(result[name])]
+    if isinstance(result, (tuple, list)) or (isinstance(result, np.ndarray) and result.dtype == object):
+        return [part for item in result for part in parts(item)]
+    return [result.tobytes() if isinstance(result, np.ndarray) else result]
+
+
+def spoil(result):
+    """Write to all arrays of a result."""
+    for item in result.values() if isinstance(result, dict) else result:
+        if isinstance(item, np.ndarray) and item.dtype != object:
+            item[...] = 1 if item.dtype.kind in "bU" else 77
+        elif isinstance(item, (dict, tuple, list, np.ndarray)):
+            spoil(item)
+
+
+class ModelState:
+    """A simulated search with the interface of an environment; several kinds of objects hang on it."""
+
+    def __init__(self):
+        env = gym.make("parkenv/Search-v2", scenario="mini")
+        self.model = parkenv.model(env.unwrapped.scenario)
+        self.belief = self.model.initial_belief(env.reset(seed=0)[0])
+
+    def reset(self, seed):
+        self.states = self.model.sample(self.belief, np.random.default_rng(seed), 3)
+        return tuple(self.states.observation(2))
+
+    def step(self, action):
+        costs, over = self.states.step(np.full(3, action))
+        _, seen, *rest = self.model.step(self.model.sample(self.belief, np.random.default_rng(1)), action)
+        return costs, over, tuple(self.states.observation(2)), tuple(seen), rest
+
+
+class Batch:
+    """Gives every search of a batch the same action."""
+
+    def __init__(self, **options):
+        options = {"num_envs": 3, "scenario": "mini", "max_episode_steps": 4} | options
+        self.envs = ParkSearchVectorEnv(**options)
+
+    def reset(self, seed):
+        return self.envs.reset(seed=seed)
+
+    def step(self, action):
+        return self.envs.step(np.full(3, action))
+
+
+class Learner(Batch):
+    """As stable-baselines3 has it."""
+
+    def __init__(self):
+        from parkenv.envs.sb3 import SearchVecEnv
+
+        self.envs = SearchVecEnv(3, "mini", observation="full", max_episode_steps=4)
+
+    def reset(self, seed):
+        self.envs.seed(seed)
+        return self.envs.reset(), self.envs.action_masks()
+
+    def step(self, action):
+        return *super().step(action), self.envs.action_masks()
+
+
+def single(name="Search-v2", **options):
+    return gym.make(f"parkenv/{name}", **{"scenario": "mini"} | options).unwrapped
+
+
+KINDS = {
+    "full": single,
+    "local": lambda: single(observation="local"),
+    "occupancy": lambda: single(observation="occupancy", flat=True),
+    "scans": lambda: single("SearchSensors-v2", observation="scan"),
+    "recorded": lambda: single("SearchSensors-v2", scenario=recorded_scenario(), observation="scan"),
+    "wrapped": lambda: LocalObservation(gym.make("parkenv/Search-v2", scenario="mini")),
+    "model": ModelState,
+    "batch": Batch,
+    "batch of two lots": lambda: Batch(scenario=["mini", grid_lot(3, 8)]),
+    "batch of occupancies": lambda: Batch(observation="occupancy", autoreset_mode=AutoresetMode.SAME_STEP),
+    "local batch": lambda: Batch(observation="local"),
+    "learner": Learner,
+}
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return KINDS[request.param]
+
+
+def run(world, actions):
+    return [parts(world.step(action)) for action in actions]
+
+
+@pytest.mark.parametrize(
+    "twin_of", [copy.copy, copy.deepcopy, lambda world: pickle.loads(pickle.dumps(world))]
+)
+def test_a_copy_goes_on_alone_as_the_original_would(kind, twin_of):
+    plain, world = kind(), kind()
+    for each in (plain, world):
+        each.reset(seed=3)
+        each.step(3)
+    wanted = run(plain, DRIVEN[1:3])
+    if twin_of is copy.copy and isinstance(world, (Batch, ModelState)):
+        twin, inner = copy.copy(world), "states" if isinstance(world, ModelState) else "envs"
+        setattr(twin, inner, copy.copy(getattr(world, inner)))
+    else:
+        twin = twin_of(world)
+    run(twin, (1, 1))
+    again = twin_of(world) if twin_of is not copy.copy else None
+    assert run(world, DRIVEN[1:3]) == wanted
+    if again is not None:
+        del world
+        assert run(again, DRIVEN[1:3]) == wanted
+
+
+def test_pickles_go_on_in_another_process():
+    worlds = [make() for make in KINDS.values()]
+    for world in worlds:
+        world.reset(seed=3)
+        world.step(3)
+    sent = pickle.dumps(worlds)
+    wanted = [run(world, DRIVEN[1:3]) for world in worlds]
+    code = "import pickle, sys; from test_copies import *; " + (
+        "sys.stdout.buffer.write(pickle.dumps([run(w, DRIVEN[1:3]) for w in pickle.load(sys.stdin.buffer)]))"
+    )
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], input=sent, stdout=-1, check=True, env=env)
+    assert pickle.loads(done.stdout) == wanted
+
+
+def test_what_a_caller_does_to_results_changes_nothing_later(kind):
+    plain, world = kind(), kind()
+    plain.reset(seed=3)
+    spoil(world.reset(seed=3))
+    for action in DRIVEN[:4]:
+        result, wanted = world.step(action), plain.step(action)
+        assert parts(result) == parts(wanted)
+        spoil(result)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("observation", ["full", "occupancy", "local"])
+def test_a_batch_goes_on_from_a_state_in_which_searches_have_ended(mode, observation):
+    made = [
+        ParkSearchVectorEnv(4, "mini", observation=observation, max_episode_steps=2, autoreset_mode=mode)
+        for _ in range(2)
+    ]
+    envs = made[0]
+    envs.reset(seed=0)
+    for _ in range(2):
+        envs.step(np.full(4, 3))
+    saved, reset = envs.get_state(), {"reset_mask": np.array([True, False, True, True])}
+
+    def go_on(envs):
+        if mode is AutoresetMode.DISABLED:
+            with pytest.raises(gym.error.ResetNeeded):
+                envs.step(np.full(4, 3))
+            return parts((envs.reset(options=reset), envs.reset()))
+        return [parts(envs.step(np.full(4, action))) for action in DRIVEN]
+
+    wanted = go_on(envs)
+    for each in made:
+        each.set_state(saved)
+        assert go_on(each) == wanted
