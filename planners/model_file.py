@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -38,6 +39,8 @@ OBSERVATION = "local-1"
 _MAX_BYTES = 500_000_000
 _MAX_WEIGHT = 1e6  # products of larger ones over several layers could overflow
 _ZIP = b"PK"
+_NORMALIZATION = "normalization"
+_TRANSFORMING = (gym.ObservationWrapper, gym.ActionWrapper)
 
 # Bounds, so that a card cannot ask for more memory than a network of a few million weights needs.
 Width = Annotated[int, Field(ge=1, le=1024)]
@@ -137,9 +140,12 @@ class ModelCard(_WithNulls):
 
     def build(self) -> Any:
         """Build the policy, with random weights."""
+        from torch.random import fork_rng
+
         kind = algorithm_class(self.algorithm).policy_aliases[self.policy]
         actions = spaces.Discrete(len(ACTIONS))
-        return kind(local_space(self.k), actions, lambda _: 0.0, **self.policy_options.arguments())
+        with fork_rng(devices=[]):  # the weights are replaced
+            return kind(local_space(self.k), actions, lambda _: 0.0, **self.policy_options.arguments())
 
 
 def algorithm_class(name: str) -> Any:
@@ -163,7 +169,8 @@ def save_model(
     """Write a model of stable-baselines3 or sb3-contrib to a model file, atomically.
 
     Args:
-        model: trained on `parkenv.envs.sb3.SearchVecEnv`, or another environment of the `local` observation.
+        model: trained on `parkenv.envs.sb3.SearchVecEnv`, or another environment of the `local` observation. The
+            statistics of `VecNormalize` around it are saved; other wrappers that change observations are refused.
         path: file to write; its name should end in `.safetensors`.
         scenarios: names of the training scenarios.
         held_out: names of the places that it was evaluated in, and never trained on.
@@ -172,8 +179,8 @@ def save_model(
         command: command line of the training, for the card.
 
     Raises:
-        InputError: the model is of another algorithm or observation, or its policy has an option that a card cannot
-            hold.
+        InputError: the model is of another algorithm or observation, or its policy has an option, or its environment
+            a wrapper, that a model file cannot hold.
     """
     from safetensors.torch import save
 
@@ -200,6 +207,7 @@ def save_model(
     )  # fmt: skip
     # Networks may share tensors; safetensors wants each on its own.
     weights = {key: value.detach().cpu().clone() for key, value in model.policy.state_dict().items()}
+    weights |= Normalization.of_model(model).tensors
     with atomic_write(path) as beside:
         beside.write_bytes(save(weights, {CARD_KEY: card.model_dump_json()}))
 
@@ -213,8 +221,8 @@ def slots_observed(space: spaces.Space[Any]) -> int:
     return k
 
 
-def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard, Any]:
-    """Load the card and policy of a model trained with an algorithm; no code from the file is run."""
+def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard, Any, Normalization]:
+    """Load card, policy and normalization of a model trained with an algorithm; no code from the file is run."""
     data = read_bytes(Path(path), _MAX_BYTES)
     card = ModelCard._of_bytes(data, path)
     if card.algorithm != algorithm:
@@ -228,13 +236,90 @@ def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard,
         weights = import_module("safetensors.torch").load(data)
         if not all(bool((w.abs() <= _MAX_WEIGHT).all()) for w in weights.values()):
             raise InputError(f"{path}: has weights that are no numbers, or above {_MAX_WEIGHT:g}")
+        normalization = Normalization.take_from(weights, policy.observation_space)
         policy.load_state_dict(weights)
     except InputError:
         raise
     except Exception as error:  # torch and stable-baselines3 raise many types for weights that do not fit
         raise InputError(f"{path}: its network cannot be read ({type(error).__name__}: {error})") from error
     policy.set_training_mode(False)
-    return card, policy
+    return card, policy, normalization
+
+
+class Normalization:
+    """Statistics by which `VecNormalize` of stable-baselines3 shifts and scales what a model observes.
+
+    They are tensors of the model file: `normalization.KEY`, (2, n) float64, mean and variance of each number, and
+    `normalization`, epsilon and the bound of the results.
+    """
+
+    def __init__(self, tensors: Mapping[str, Any]) -> None:
+        self.tensors = tensors
+
+    @classmethod
+    def of_model(cls, model: Any) -> Self:
+        """Return what the model's environment does to observations.
+
+        Raises:
+            InputError: it does something that a model file cannot hold, such as stacking frames.
+        """
+        from stable_baselines3.common.vec_env import VecCheckNan, VecEnvWrapper, VecMonitor, VecNormalize
+        from stable_baselines3.common.vec_env import VecVideoRecorder as VecVideo
+
+        env, tensors = model.get_env(), dict[str, Any]()
+        if env is None:
+            told = "the model has no environment: statistics of VecNormalize, if it was trained with any, are not saved"
+            warnings.warn(told, stacklevel=3)
+        while isinstance(env, VecEnvWrapper):
+            name = type(env).__name__
+            if type(env) is VecNormalize and not tensors:
+                tensors = cls._statistics(env)
+            elif not isinstance(env, (VecCheckNan, VecMonitor, VecVideo)):
+                raise InputError(
+                    f"the model's environment is wrapped in {name}, which a model file cannot hold"
+                )
+            env = env.venv
+        if env is not None and any(any(env.env_is_wrapped(kind)) for kind in _TRANSFORMING):
+            raise InputError("the model's environment has a wrapper of observations or actions, want none")
+        return cls(tensors)
+
+    @staticmethod
+    def _statistics(env: Any) -> dict[str, Any]:
+        import torch
+
+        if not env.norm_obs:
+            return {}
+        moments = {f"{_NORMALIZATION}.{key}": env.obs_rms[key] for key in env.norm_obs_keys}
+        tensors = {key: torch.as_tensor(np.stack([m.mean, m.var])).double() for key, m in moments.items()}
+        bounds = [env.epsilon, min(env.clip_obs, _MAX_WEIGHT)]
+        return tensors | {_NORMALIZATION: torch.tensor(bounds, dtype=torch.float64)}
+
+    @classmethod
+    def take_from(cls, tensors: dict[str, Any], space: spaces.Dict) -> Self:
+        """Remove the statistics from the tensors of a model file; a ValueError says why they do not fit."""
+        names = [key for key in tensors if key.split(".")[0] == _NORMALIZATION]
+        given = {name: tensors.pop(name).double().numpy() for name in names}
+        shapes = {_NORMALIZATION: (2,)} | {
+            f"{_NORMALIZATION}.{key}": (2, *box.shape) for key, box in space.items()
+        }  # type: ignore[misc]
+        for name, values in given.items():
+            if values.shape != shapes.get(name) or (values[1] < 0.0).any() or _NORMALIZATION not in given:
+                raise ValueError(f"{name} is no {shapes.get(name)} array of statistics")
+        if given and given[_NORMALIZATION][0] <= 0.0:
+            raise ValueError("epsilon is not above 0")
+        return cls(given)
+
+    def __call__(self, observation: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Return the observation as the model observed it in training; rounded as `VecNormalize` does."""
+        seen = dict(observation)
+        for name, statistics in self.tensors.items():
+            if name == _NORMALIZATION:
+                continue
+            (epsilon, bound), (mean, variance) = self.tensors[_NORMALIZATION], statistics
+            key = name.partition(".")[2]
+            scaled = (seen[key] - mean) / np.sqrt(variance + epsilon)
+            seen[key] = np.clip(scaled, -bound, bound).astype(np.float32)
+        return seen
 
 
 class LearnedAgent:
@@ -243,7 +328,7 @@ class LearnedAgent:
     def __init__(self, problem: SearchProblem, algorithm: str, path: str | os.PathLike[str]) -> None:
         self.name = f"{algorithm}:{path}"
         self.problem = problem.public()
-        self.card, self.model = load_model(algorithm, path)
+        self.card, self.model, self.normalization = load_model(algorithm, path)
         lots = self.card.scenarios
         if lots and not {problem.lot.name, getattr(problem, "name", "")} & {*lots, *self.card.held_out}:
             named = ", ".join(lots[:3]) + (f" and {len(lots) - 3} more" if len(lots) > 3 else "")
@@ -268,10 +353,11 @@ class LearnedAgent:
             raise InputError(
                 f"{self.name} observes {wanted[0]} numbers, got {given[0]} for its k = {self.card.k}"
             )
-        if not np.any(observation["action_mask"], axis=-1).all():
-            raise InputError("action_mask allows nothing; a search that goes on allows at least one action")
-        masks = {"action_masks": observation["action_mask"]} if self.card.algorithm == "maskable-ppo" else {}
+        # At a dead end there is no action, and whatever is chosen waits.
+        mask = observation["action_mask"] | ~np.any(observation["action_mask"], axis=-1, keepdims=True)
+        masks = {"action_masks": mask} if self.card.algorithm == "maskable-ppo" else {}
         action, state = self.model.predict(
-            dict(observation), state=state, episode_start=episode_start, deterministic=deterministic, **masks
-        )
+            self.normalization(observation), state=state, episode_start=episode_start, deterministic=deterministic,
+            **masks,
+        )  # fmt: skip
         return action, state

@@ -9,9 +9,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from parkenv import lot_v0
 from parkenv.envs.flat_ids import OPTIONS
+from parkenv.envs.sb3 import SearchVecEnv
+from parkenv.errors import InputError
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
 
@@ -134,3 +137,41 @@ def test_policies_of_stable_baselines_learn_from_sensors():
     network = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}}
     model = PPO("MultiInputPolicy", env, n_steps=100, batch_size=50, n_epochs=1, policy_kwargs=network)
     assert model.learn(200).num_timesteps == 200
+
+
+def test_start_options_hold_for_the_next_reset_of_a_batch_and_wrong_ones_for_none():
+    times = lambda envs: (envs.reset()["time"][:, 0] / 3600.0).round(1).tolist()  # noqa: E731
+    envs = SearchVecEnv(2, "campus", observation="full")
+    like = DummyVecEnv([lambda: gym.make("parkenv/Search-v2", scenario="campus")] * 2)
+    envs.seed(3), like.seed(3)
+    for given in ({"arrival": "Tue 08:30"}, [{"arrival": "Wed 09:00"}, {}], {}):
+        envs.set_options(given), like.set_options(given)
+        assert times(envs) == times(like)
+    for wrong in ({"nonsense": 1}, [{"arrival": "Tue 08:30"}, {"entry": 99}], [{}]):
+        envs.set_options(wrong)
+        with pytest.raises(InputError, match=r"nonsense|entry|options are 1, want 2"):
+            envs.reset()
+    envs.set_options()
+    assert times(envs) == times(like)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("Search-v2", {"max_episode_steps": -1, "observation": "occupancy"}),
+        ("Search-v2", {"max_episode_steps": 3, "observation": "local", "k": 2, "flat": True}),
+        ("SearchSensors-v2", {"captures": 1, "observation": "scan", "max_episode_steps": 3}),
+    ],
+)
+def test_make_vec_takes_what_make_takes_and_observes_the_same(name, options):
+    alone = gym.make(f"parkenv/{name}", scenario="mini", **options)
+    for mode in (None, "sync", *["vector_entry_point"] * (name == "Search-v2")):
+        envs = gym.make_vec(f"parkenv/{name}", 2, mode, scenario="mini", **options)
+        assert envs.single_observation_space == alone.observation_space
+        first, many = alone.reset(seed=5)[0], envs.reset(seed=5)[0]
+        for _ in range(3):
+            row = {key: value[0] for key, value in many.items()} if isinstance(many, dict) else many[0]
+            np.testing.assert_equal(row, first)
+            first, _, *ends, _ = alone.step(3)
+            many, _, terminated, truncated, _ = envs.step([3, 3] if mode == "sync" else np.array([3, 3]))
+            assert [terminated[0], truncated[0]] == ends

@@ -4,6 +4,7 @@ import base64
 import json
 import pathlib
 import pickle
+import random
 import tempfile
 import zipfile
 
@@ -17,6 +18,7 @@ from sb3_contrib import MaskablePPO
 from small_trainings import make_small, search_training, stop_training
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecFrameStack, VecNormalize
 
 from parkenv import make_scenario
 from parkenv.envs.local_observation import LocalObservation
@@ -265,6 +267,69 @@ def test_only_models_that_can_be_described_are_saved(tmp_path):
         save_model(plain, tmp_path / "m.safetensors")
 
 
+WRAPPED = {
+    "only local": lambda: VecNormalize(
+        SearchVecEnv(4, "mini"), norm_obs_keys=["local"], clip_obs=0.7, epsilon=0.1
+    ),
+    "all, as rl-zoo3": lambda: VecNormalize(VecCheckNan(SearchVecEnv(4, "mini"))),
+    "rewards": lambda: VecNormalize(SearchVecEnv(4, "mini"), norm_obs=False),
+    "single": lambda: VecNormalize(DummyVecEnv([lambda: LocalObservation(gym.make("parkenv/Search-v2"))])),
+}
+
+
+@pytest.mark.parametrize("wrapped", WRAPPED)
+@pytest.mark.parametrize("kind", [PPO, MaskablePPO])
+def test_a_model_file_keeps_how_observations_were_normalised(tmp_path, wrapped, kind):
+    envs = WRAPPED[wrapped]()
+    model = kind("MultiInputPolicy", envs, 0.01, n_steps=32, batch_size=32, seed=0, device="cpu").learn(128)
+    name = "ppo" if kind is PPO else "maskable-ppo"
+    save_model(model, tmp_path / "m.safetensors")
+    before = torch.get_rng_state()
+    agent = make_agent(f"{name}:{tmp_path / 'm.safetensors'}", make_scenario("mini"))
+    assert torch.equal(torch.get_rng_state(), before)
+    raw = ParkSearchVectorEnv(50, "mini", "local")
+    seen, _ = raw.reset(seed=1)
+    for _ in range(5):
+        masks = {} if kind is PPO else {"action_masks": seen["action_mask"]}
+        actions, _ = model.predict(envs.normalize_obs(seen), deterministic=True, **masks)
+        np.testing.assert_array_equal(agent.predict(seen)[0], actions)
+        np.testing.assert_array_equal(
+            agent.normalization(seen)["local"], envs.normalize_obs(seen)["local"], err_msg=wrapped
+        )
+        seen = raw.step(actions)[0]
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda: VecFrameStack(SearchVecEnv(2, "mini"), 2),
+        lambda: VecNormalize(VecNormalize(SearchVecEnv(2, "mini"))),
+        lambda: gym.wrappers.TransformObservation(
+            gym.make("parkenv/Search-v2", observation="local"), dict, None
+        ),
+    ],
+)
+def test_models_of_other_wrappers_are_refused_when_they_are_saved(tmp_path, wrap):
+    model = PPO("MultiInputPolicy", wrap(), n_steps=8, batch_size=8)
+    with pytest.raises(InputError, match=r"wrap|does not observe `local`"):
+        save_model(model, tmp_path / "m.safetensors")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_training_in_this_process_leaves_global_seeds_and_threads(tmp_path):
+    torch.set_num_threads(2)
+    random.seed(1), np.random.seed(1), torch.manual_seed(1)  # noqa: NPY002
+    drawn = random.getstate(), np.random.get_state(), torch.get_rng_state().tolist()  # noqa: NPY002
+    try:
+        fields = {"steps": 100, "trainings": 1, "agents": [], "evaluation_episodes": 2, "jobs": 1}
+        run(TrainingSpec.parse({"algorithm": "ppo", "scenarios": ["mini"], **fields}, ""), tmp_path)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
+    now = random.getstate(), np.random.get_state(), torch.get_rng_state().tolist()  # noqa: NPY002
+    np.testing.assert_equal(now, drawn)
+
+
 def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
     make_small(monkeypatch)
     mark = tmp_path / "was_run"
@@ -334,19 +399,26 @@ def test_a_finished_training_goes_on_with_more_steps(tmp_path):
         run(long.changed(steps=2_000), tmp_path, resume=True)
 
 
-def test_observations_of_another_kind_and_masks_that_allow_nothing_are_refused(trained):
+def test_observations_of_another_kind_are_refused_and_a_dead_end_is_waited_at(trained):
     agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.safetensors")
     env = gym.make("parkenv/Search-v2", scenario=SCENARIO)
     for observation, wanted in (
         (env.reset(seed=0)[0], r"wants observations of .*LocalObservation, got vertex, time"),
         (LocalObservation(env, k=7).reset(seed=0)[0], "observes 86 numbers, got 102 for its k = 5"),
-        (
-            {"local": np.zeros(86, np.float32), "action_mask": np.zeros(5, np.int8)},
-            "action_mask allows nothing",
-        ),
     ):
         with pytest.raises(InputError, match=wanted):
             agent.predict(observation)
+    dead_end = {
+        "local": np.zeros((2, 86), np.float32),
+        "action_mask": np.array([[0] * 5, [0, 0, 1, 0, 0]], np.int8),
+    }
+    actions = agent.predict(dead_end)[0]
+    assert actions[1] == 2
+    assert 0 <= actions[0] <= 4
+    observation = gym.make("parkenv/Search-v2", scenario=SCENARIO).reset(seed=0)[0]
+    observation["action_mask"][:] = 0
+    lone, vertex = make_agent("random", SCENARIO), observation["vertex"]
+    assert SCENARIO.lot.neighbors[vertex, lone.predict(observation)[0]] < 0
     with pytest.warns(UserWarning, match="was trained on .*, not on street$"):
         LearnedAgent(make_scenario("street"), "maskable-ppo", trained / "model.safetensors")
 

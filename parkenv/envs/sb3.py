@@ -42,7 +42,10 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
 
     def reset(self) -> dict[str, NDArray[Any]]:
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
-        observations, _ = self.batch.reset(seed=seeds)
+        options: Any = self._options
+        if options and options == options[:1] * self.num_envs:
+            options = options[0]
+        observations, _ = self.batch.reset(seed=seeds, options=options)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -121,6 +124,8 @@ class SearchVecEnv(BatchVecEnv):
         k: number of slots in the `local` observation, 5 if None.
         observation: `local`; for a single lot also `full`.
         max_episode_steps: steps after which a search is truncated.
+
+    `set_options` takes the options of `reset`, one dictionary or one for each search; they hold for the next reset.
 
     Raises:
         InputError: an argument out of its range; the message names it.

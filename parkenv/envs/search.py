@@ -31,7 +31,7 @@ from parkenv.engine.local_observation import (
 from parkenv.engine.searches import START_OPTIONS, ScenarioRecords, Searches, choose_start
 from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout, action_number, space_of
 from parkenv.engine.state import SearchState
-from parkenv.errors import require, require_number, require_one_of, reset_options
+from parkenv.errors import InputError, require, require_number, require_one_of, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
 from parkenv.world.lot import ACTIONS
 from parkenv.world.occupancy.process import raise_error
@@ -303,7 +303,14 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._seeded_with = self.np_random_seed
             record["seed_state"] = seed_state(self.np_random_seed)
         if starts:
-            choose_start(self.searches, 0, int(record["episode"]), starts)
+            before = record.copy()
+            try:
+                choose_start(self.searches, 0, int(record["episode"]), starts)
+            except InputError:
+                self.searches.records[0] = (
+                    before  # so that no later reset uses what was valid of these options
+                )
+                raise
         begin_search_at(self._address)
         if self.searches.needs_python:
             self.searches.complete_arrival(0)

@@ -100,7 +100,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
       returns a `parkenv.engine.batch.Observer`.
     - `k`: number of slots that `local` describes, 5 if None.
     - `flat`, `reward_scale`: as in `parkenv/Search-v2`.
-    - `max_episode_steps`: 2000 from `make_vec`.
+    - `max_episode_steps`: 2000 from `make_vec`; -1 or None for no limit.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
     - `copy`: False returns arrays that the next step overwrites, which saves copying them.
     - `render_mode`: `rgb_array`: `render()` returns a tuple with a frame of each search, (480, 640, 3) uint8.
@@ -144,6 +144,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         **changes: Any,
     ) -> None:
         require_whole("num_envs", num_envs, least=1, most=MAX_ENVS)
+        if max_episode_steps == -1:  # Gymnasium's word for no limit
+            max_episode_steps = None
         if max_episode_steps is not None:
             require_whole("max_episode_steps", max_episode_steps, least=1, most=2**31 - 1)
         require_one_of("render_mode", render_mode, (None, "rgb_array"))
@@ -230,20 +232,33 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return f"{type(self).__name__}({self.num_envs} searches, {places}, {self.memory_bytes / 1e6:.1f} MB)"
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | Sequence[dict[str, Any]] | None = None,
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Start a search in every environment, or in those of `options["reset_mask"]`, (n_envs,) bool.
 
         Args:
             seed: seed of the first environment, counting up for the others; or a sequence of one per environment, where
                 None continues with the next world of the environment's seed; or None to continue all of them.
-            options: `reset_mask`, and those of `parkenv/Search-v2` for all searches that are reset.
+            options: `reset_mask`, and those of `parkenv/Search-v2` for all searches that are reset; or a sequence of
+                the latter, one for each search.
 
         Raises:
             InputError: an unknown option, or a number of seeds that differs from the number of environments.
         """
-        starts = reset_options(options, (*START_OPTIONS, "reset_mask"))
-        given = starts.pop("reset_mask", None)
+        given = None
+        if isinstance(options, Sequence):
+            starts = [reset_options(own, START_OPTIONS) for own in options]
+            require(
+                len(starts) == self.num_envs,
+                f"options are {len(starts)}, want {self.num_envs}, or one for all",
+            )
+        else:
+            start = reset_options(options, (*START_OPTIONS, "reset_mask"))
+            given = start.pop("reset_mask", None)
+            starts = [start] * self.num_envs
         which = np.ones(self.num_envs, dtype=np.bool_) if given is None else np.asarray(given)
         require(
             which.shape == (self.num_envs,) and which.dtype == np.bool_,
@@ -268,12 +283,17 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             first = int(self.np_random.integers(1 << 62)) if known is None or known < 0 else known
             seeds = [first + i if given is None else given for i, given in enumerate(seeds)]
         records = self._searches.records
-        for i in np.flatnonzero(which):
-            given = seeds[i]
-            if given is not None:
-                records[i]["seed_state"], records[i]["episode"] = seed_state(given), -1
-            if starts:
-                choose_start(self._searches, int(i), int(records[i]["episode"]) + 1, starts)
+        before = records.copy() if any(starts) else records
+        try:
+            for i in np.flatnonzero(which):
+                given = seeds[i]
+                if given is not None:
+                    records[i]["seed_state"], records[i]["episode"] = seed_state(given), -1
+                if starts[i]:
+                    choose_start(self._searches, int(i), int(records[i]["episode"]) + 1, starts[i])
+        except InputError:
+            records[:] = before  # so that no later reset uses what was valid of these options
+            raise
         self._begun = True
         self._arrive(which)
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)

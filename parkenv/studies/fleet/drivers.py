@@ -46,9 +46,10 @@ def policy_of(
 ) -> tuple[CompiledPolicy | None, Any]:
     """Return the compiled policy of an agent, or else the agent itself, which decides in Python.
 
-    Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
-    actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
-    An agent that expects rivals gets how many cars arrive in an hour, if that is a number, as by a forecast of traffic.
+    Heuristics and trained networks without memory and normalization are compiled. Networks of policies (ppo,
+    maskable-ppo) draw their actions, as in training, so that equal cars do not all do the same; the draws follow from
+    the world and the car. An agent that expects rivals gets how many cars arrive in an hour, if that is a number, as by
+    a forecast of traffic.
     """
     if not spec.options and spec.name in POLICIES:
         return POLICIES[spec.name], None
@@ -59,7 +60,8 @@ def policy_of(
         return agent.compiled_policy(), None
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
-    if isinstance(agent, LearnedAgent) and agent.card.algorithm != "recurrent-ppo":
+    plain = isinstance(agent, LearnedAgent) and not agent.normalization.tensors
+    if isinstance(agent, LearnedAgent) and plain and agent.card.algorithm != "recurrent-ppo":
         sampled = agent.card.algorithm != "dqn"
         return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     if isinstance(agent, LearnedAgent) or not scenario.has_rules:
