@@ -143,9 +143,6 @@ FAULTS = {
     "node_twice.osm": (
         with_text(lambda t: t.replace("<way", '<node id="1" lat="48.1" lon="7.8"/><way', 1)), "node/1 appears twice"
     ),
-    "way_twice.osm": (
-        with_text(lambda t: t.replace("</osm>", f'<way id="1"><nd ref="2"/>{TAG}</way></osm>')), "way/1 appears twice"
-    ),
     "swapped.osm": (
         with_text(lambda t: re.sub(r'(<node id="1" )lat="(.*?)" lon="(.*?)"', r'\1lat="\3" lon="\2"', t)),
         r"way/\d+ is at 7\.8\d+, 4\d\.\d+ .* swapped",
@@ -160,10 +157,9 @@ FAULTS = {
     "far.geojson": (
         lambda: car_park().geojson().replace('"coordinates": [[', '"coordinates": [[200, ', 1), "way/1: lon is 200"
     ),
-    "overpass.json": (lambda: '{"elements": []}', "Overpass JSON"),
+    "overpass.json": (lambda: '{"elements": []}', "no parking"),
     "a.shp": (lambda: "", r"'\.shp'"),
 }  # fmt: skip
-TAG = '<tag k="highway" v="service"/>'
 
 
 @pytest.mark.parametrize(

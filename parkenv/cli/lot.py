@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 from typer import Exit
 
@@ -154,7 +156,16 @@ def _square(text: str) -> tuple[float, ...]:
     from parkenv.lots.local_frame import LocalFrame
 
     lat, lon, metres = numbers_in(text, 3)
-    (west, south), (east, north) = LocalFrame(lon, lat).to_lonlat([[-metres] * 2, [metres] * 2]).tolist()
+    # Near a pole the corners are not the farthest points.
+    side = np.linspace(-metres, metres, 41)
+    edge = [(x, y) for x in side for y in side if metres in (abs(x), abs(y))]
+    at = LocalFrame(lon, lat).to_lonlat(edge)
+    (west, south), (east, north) = at.min(axis=0).tolist(), at.max(axis=0).tolist()
+    pole = math.copysign(90.0, lat)
+    if LocalFrame(lon, lat).to_xy([[lon, pole]])[0, 1] * math.copysign(1.0, lat) <= metres:
+        return min(south, pole), -180.0, max(north, pole), 180.0
+    if east - west > 180.0:
+        west, east = at[at[:, 0] > 0.0, 0].min().item(), at[at[:, 0] < 0.0, 0].max().item()
     return south, west, north, east
 
 

@@ -114,7 +114,9 @@ def points_in_frame(frame: LocalFrame | None, pairs: tuple[tuple[float, float], 
     points = np.array(pairs, dtype=np.float64).reshape(-1, 2)
     if frame is None or frame.origin is not None or not len(points):
         return points
-    on_globe = np.all(np.abs(points - [frame.lat, frame.lon]) <= NEAR_ON_GLOBE, axis=1, keepdims=True)
+    away = points - [frame.lat, frame.lon]
+    away[:, 1] = (away[:, 1] + 180.0) % 360.0 - 180.0  # across the date line
+    on_globe = np.all(np.abs(away) <= NEAR_ON_GLOBE, axis=1, keepdims=True)
     return np.where(on_globe, frame.to_xy(points[:, ::-1]), points)
 
 

@@ -320,6 +320,7 @@ if TYPE_CHECKING:
 
 LARGEST_DEGREES = 0.05
 """Extent, degrees, that no outline of parking exceeds (5 km); in metres all are larger than that."""
+LONGEST_DEGREES = 1.0  # the same of a map of streets
 _CRS = re.compile(
     r"(?:urn:ogc:def:crs:|https?://www\.opengis\.net/def/crs/)?(EPSG|OGC|ESRI)[:/].*?([A-Za-z0-9]+)"
 )
@@ -363,9 +364,13 @@ class Positions:
                     f"crs is {grid[1]}, in which the positions lie nowhere on the globe; {_ADVICE}"
                 )
             return cls(found=f"positions are in {grid[1]}, as the file's crs says", grid=grid[0])
+        if document.get("crs") is not None:
+            return cls()  # degrees, as it says
         # The smaller side: a ring across the date line is 360° long.
-        if rings and float(np.median([np.ptp(ring, axis=0).min() for ring in rings])) > LARGEST_DEGREES:
-            raise InputError(f"outlines are wider than {LARGEST_DEGREES:g}, too wide for degrees; {_ADVICE}")
+        are_closed = [np.array_equal(ring[0], ring[-1]) and len(ring) > 3 for ring in rings]
+        widest = LARGEST_DEGREES if all(are_closed) else LONGEST_DEGREES
+        if rings and float(np.median([np.ptp(ring, axis=0).min() for ring in rings])) > widest:
+            raise InputError(f"shapes are wider than {widest:g}, too wide for degrees; {_ADVICE}")
         return cls()
 
 

@@ -14,8 +14,8 @@ ways; others are listed: over a way, at some hours only (`restriction:conditiona
 """
 
 import re
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,8 +29,9 @@ from parkenv.errors import InputError, naming, with_extra
 from parkenv.files.limited_reading import read_json, require_file, unpacked_path
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.formats.geojson import Positions
+from parkenv.lots.osm.answers import Answer, Location, Member, elements_of_xml, has_geometry, refuse_partial
+from parkenv.lots.osm.export_tags import NESTED, OSM_ID, id_of_feature, tags_of_feature
 
-OSM_ID = re.compile(r"(node|way|relation)/-?\d+")
 MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
 """Keys that distinguish elements of OpenStreetMap from other GeoJSON."""
 KEYS = (*MAPPED_KEYS, "noexit", "shop", "office", "craft", "healthcare", "tourism", "leisure")
@@ -42,6 +43,7 @@ MOST_ELEMENTS = 5_000_000
 CAR_KEYS = frozenset(("motorcar", "motor_vehicle", "vehicle"))
 TURN_KEYS = (*(f"restriction:{key}" for key in ("motorcar", "motor_vehicle", "vehicle")), "restriction")
 """Keys of a restriction of turns that holds for cars, the most specific first."""
+_APART = 3e-8  # degrees, some 3 mm: nodes at this distance are not the same
 _SAME = 1e-6  # degrees, some 0.1 m: a cut nearer to a node is at the node
 BEYOND = (np.nan, np.nan)  # position of a node that is not in the file
 
@@ -94,13 +96,17 @@ class OsmMap:
     def within(self, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Self:
         """Cut roads at a box, two corners of latitude and longitude; others need half of their corners inside."""
         corners = np.array(bounds)[:, ::-1]
+        # West of east; on the globe, a box of more than half of it is across the date line.
+        across = np.ptp(corners[:, 0]) > 180.0 and np.ptp(corners[:, 0]) < 360.0
+        corners[:, 0] += 360.0 * (across & (corners[:, 0] < 0.0))
+        elements = [_beyond_date_line(e) for e in self.elements] if across else self.elements
         low, high = corners.min(axis=0), corners.max(axis=0)
         inside = [
             float(((xy >= low) & (xy <= high)).all(axis=1).mean()) if len(xy) else 0.0
-            for xy in (np.concatenate(e.lines) for e in self.elements)
+            for xy in (np.concatenate(e.lines) for e in elements)
         ]
         kept, beyond = [], []
-        for element, share in zip(self.elements, inside, strict=True):
+        for element, share in zip(elements, inside, strict=True):
             if share < 1.0 and not element.is_node and "highway" in element.tags:
                 clipped = shapely.clip_by_rect(shapely.MultiLineString(list(element.lines)), *low, *high)
                 parts = shapely.get_parts(shapely.remove_repeated_points(clipped, _SAME))
@@ -123,6 +129,9 @@ def read_map(path: Path) -> OsmMap:
         return _read_osm(path)
     content = read_json(path)
     with naming(path):
+        if isinstance(content, dict) and isinstance(content.get("elements"), list):
+            refuse_partial(content.get("remark"))
+            return _map_of_overpass(content["elements"])
         if not isinstance(content, dict) or not isinstance(content.get("features"), list):
             raise InputError("no features, want a GeoJSON FeatureCollection, or a map as .osm or .osm.pbf")
         return _map_of_geojson(content["features"], Positions.of(content))
@@ -133,6 +142,8 @@ def place_name(path: Path) -> str:
 
 
 def holds_osm(document: object) -> bool:
+    if isinstance(document, dict) and isinstance(document.get("elements"), list):
+        return True
     features = document.get("features") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(features, list) or "parkenv" in document:
         return False
@@ -142,7 +153,7 @@ def holds_osm(document: object) -> bool:
         return False
     properties = [f["properties"] for f in features if isinstance(f, dict) and _is_object(f, "properties")]
     return not any("kind" in p for p in properties) and any(
-        "@id" in p or _is_object(p, "tags") or any(key in p for key in MAPPED_KEYS) for p in properties
+        "@id" in p or any(key in p for key in (*NESTED, *MAPPED_KEYS)) for p in properties
     )
 
 
@@ -152,7 +163,7 @@ def _holds_outlines(features: list[Any]) -> bool:
         isinstance(f, dict)
         and _is_object(f, "geometry")
         and f["geometry"].get("type") == "Polygon"
-        and not any(key in (f.get("properties") or {}) for key in ("kind", "tags", "@id", *MAPPED_KEYS))
+        and not any(key in (f.get("properties") or {}) for key in ("kind", "@id", *NESTED, *MAPPED_KEYS))
         for f in features
     )
 
@@ -164,9 +175,14 @@ class _NoTurnError(Exception):
     """Why a restriction of turns is not read."""
 
 
+Ref = int | tuple[float, float]
+"""A node: its id, or where it is, degrees, if a file has positions in place of ids."""
+
+
 class _Way(NamedTuple):
     tags: dict[str, str]
-    refs: list[int]
+    refs: list[Ref]
+    rank: tuple[int, bool, int]  # version, whether it has tags, number of nodes: the greater wins
 
 
 class _Relation(NamedTuple):
@@ -179,12 +195,14 @@ class _Relation(NamedTuple):
 
 @dataclass
 class _RawElements:
-    positions: dict[int, tuple[float, float]] = field(default_factory=dict)
+    positions: dict[Ref, tuple[float, float]] = field(default_factory=dict)
+    versions: dict[int, int] = field(default_factory=dict)  # of nodes
     node_tags: dict[int, dict[str, str]] = field(default_factory=dict)
     ways: dict[int, _Way] = field(default_factory=dict)
     relations: dict[int, _Relation] = field(default_factory=dict)
+    relation_ranks: dict[int, tuple[int, int]] = field(default_factory=dict)
     needed_ways: set[int] = field(default_factory=set)
-    needed_nodes: set[int] = field(default_factory=set)
+    needed_nodes: set[Ref] = field(default_factory=set)
     left_out: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
 
     # What refers to others is added first.
@@ -193,6 +211,10 @@ class _RawElements:
         tags = dict(relation.tags)
         is_area = tags.get("type") == "multipolygon" and ("amenity" in tags or "building" in tags)
         if is_area or tags.get("type") == "restriction":
+            rank = (relation.version or 0, len(relation.members))
+            if self.relation_ranks.setdefault(relation.id, rank) > rank:
+                return
+            self.relation_ranks[relation.id] = rank
             ways = [(m.ref, m.role) for m in relation.members if m.type == "w"]
             via = [m.ref for m in relation.members if m.type == "n" and m.role == "via"]
             self.relations[relation.id] = _Relation(tags, ways, via)
@@ -201,24 +223,45 @@ class _RawElements:
 
     def add_way(self, way: Any) -> None:
         if way.id in self.needed_ways or any(key in way.tags for key in KEYS):
-            refs = [node.ref for node in way.nodes]
-            before = self.ways.get(way.id, _Way({}, refs))
-            if before.refs != refs:
+            refs, tags = [node.ref for node in way.nodes], dict(way.tags)
+            new = _Way(tags, refs, (way.version or 0, bool(tags), len(refs)))
+            old = self.ways.get(way.id, _Way({}, [], (-1, False, 0)))
+            if old.refs != refs and old.rank == new.rank:
                 raise InputError(f"way/{way.id} appears twice, with other nodes")
-            self.ways[way.id] = _Way(before.tags or dict(way.tags), refs)
+            new, old = sorted((new, old), key=lambda w: w.rank, reverse=True)
+            self.ways[way.id] = new._replace(tags=new.tags or old.tags, refs=new.refs or old.refs)
             self.needed_nodes.update(refs)
 
     def add_node(self, node: Any) -> None:
         is_wanted = any(key in node.tags for key in NODE_KEYS)
         if is_wanted or node.id in self.needed_nodes:
-            name, at = f"node/{node.id}", node.location
+            name, at, version = f"node/{node.id}", node.location, node.version or 0
             position = _position(name, at.lat_without_check(), at.lon_without_check())
-            if self.positions.setdefault(node.id, position) != position:
+            before = self.versions.get(node.id, -1)
+            if before == version and self.positions[node.id] != position:
                 raise InputError(f"{name} appears twice, at different positions")
-            if is_wanted:
+            if version >= before:
+                self.positions[node.id], self.versions[node.id] = position, version
+            if is_wanted and (version >= before or node.id not in self.node_tags):
                 self.node_tags[node.id] = dict(node.tags)
 
+    def part_levels(self) -> None:
+        """Move nodes a few millimetres that lie where nodes of streets of other levels do, as viaducts do."""
+        levels: dict[Ref, set[int]] = defaultdict(set)
+        for way in self.ways.values():
+            for ref in way.refs if "highway" in way.tags else ():
+                levels[ref].add(level_of(way.tags))
+        at: dict[tuple[float, float], list[set[int]]] = defaultdict(list)
+        for ref, own in sorted(levels.items(), key=lambda item: min(map(abs, item[1]))):
+            if (position := self.positions.get(ref)) is None:
+                continue
+            groups = at[position]
+            k = next((k for k, group in enumerate(groups) if group & own), len(groups))
+            groups[k:] = [group | own for group in groups[k : k + 1]] + groups[k + 1 :] or [own]
+            self.positions[ref] = position[0], position[1] + k * _APART
+
     def map(self) -> OsmMap:
+        self.part_levels()
         nodes = [
             OsmElement(f"node/{i}", tags, (np.array([self.positions[i]]),))
             for i, tags in self.node_tags.items()
@@ -243,7 +286,8 @@ class _RawElements:
             except _NoTurnError as reason:
                 no_turns[str(reason)].append(f"relation/{i}")
         left_out, no_turns_read = LeftOut.by_reason(self.left_out), LeftOut.by_reason(no_turns)
-        return OsmMap(nodes + ways + areas, Positions(), left_out, tuple(turns), no_turns_read)
+        once = _each_once([(e, (False, 0, -len(e.tags))) for e in nodes + ways + areas])
+        return OsmMap(once, Positions(), left_out, tuple(turns), no_turns_read)
 
     def _turns(self, name: str, relation: _Relation) -> list[OsmTurn]:
         tags = relation.tags
@@ -316,6 +360,15 @@ class _RawElements:
         return OsmElement(name, relation.tags, tuple(outer), tuple(inner), cut)
 
 
+def _beyond_date_line(element: OsmElement) -> OsmElement:
+    """Return the element with longitudes from 0 to 360."""
+    lines, holes = (
+        [np.column_stack([line[:, 0] % 360.0, line[:, 1]]) for line in own]
+        for own in (element.lines, element.holes)
+    )
+    return replace(element, lines=tuple(lines), holes=tuple(holes))
+
+
 def _is_ring(line: FloatArray) -> bool:
     return len(line) >= 4 and np.array_equal(line[0], line[-1])
 
@@ -366,6 +419,8 @@ def _read_osm(path: Path) -> OsmMap:
     source = osmium.io.File(str(path), "pbf" if path.suffix.lower() == ".pbf" else f"osm{packed}")
     raw, count = _RawElements(), 0
     with naming(path):
+        if path.suffix.lower() != ".pbf" and has_geometry(path):
+            return _map_of_overpass(elements_of_xml(path))
         try:
             for kind, add in (
                 (osmium.osm.RELATION, raw.add_relation),
@@ -393,15 +448,151 @@ def _read_osm(path: Path) -> OsmMap:
 
 def _map_of_geojson(features: list[Any], positions: Positions) -> OsmMap:
     to_lonlat = positions.to_lonlat if positions.frame or positions.grid else None
-    elements: dict[str, OsmElement] = {}
-    for index, feature in enumerate(features):
-        element = _feature_element(index, feature, to_lonlat)
-        if element is not None and elements.setdefault(element.id, element) is not element:
-            raise InputError(f"{element.id} appears twice, the second time as features[{index}]")
+    elements = [_feature_element(index, feature, to_lonlat) for index, feature in enumerate(features)]
+    pairs = [(e, _preference(f, e)) for e, f in zip(elements, features, strict=True) if e is not None]
     if _holds_outlines(features):
         tags = {"amenity": "parking_space"}
-        elements = {name: replace(element, tags=tags) for name, element in elements.items()}
-    return OsmMap(list(elements.values()), positions)
+        return OsmMap([replace(element, tags=tags) for element, _ in pairs], positions)
+    return OsmMap(_parted_levels(_each_once(pairs)), positions)
+
+
+_Preference = tuple[bool, int, int]
+
+
+def _preference(feature: Any, element: OsmElement) -> _Preference:
+    """Return what sorts the same element given several times: a closed street is a line; the newest; the fullest."""
+    properties = feature.get("properties") or {}
+    meta = properties.get("meta")
+    version = properties.get("@version", meta.get("version") if isinstance(meta, dict) else None)
+    is_area = str(feature["geometry"]["type"]).endswith("Polygon") and "highway" in element.tags
+    return is_area, -int(version) if str(version).isdecimal() else 0, -len(element.tags)
+
+
+def _each_once(pairs: Sequence[tuple[OsmElement, _Preference]]) -> list[OsmElement]:
+    """Return elements, those given several times once: with one id, or closed, with one outline and kind."""
+    for key_of in (_id_of, _outline_of):
+        groups: dict[object, list[tuple[OsmElement, _Preference]]] = defaultdict(list)
+        for pair in pairs:
+            groups[key_of(pair[0])].append(pair)
+        pairs = [(_union(group), min(p for _, p in group)) for group in groups.values()]
+    return [element for element, _ in pairs]
+
+
+def _id_of(element: OsmElement) -> object:
+    return element.id
+
+
+def _outline_of(element: OsmElement) -> object:
+    tags = element.tags
+    kind = tags.get("amenity") or ("building" if "building" in tags else tags.get("highway"))
+    named = OSM_ID.fullmatch(element.id)
+    is_alike = element.lines and (element.is_closed or not named)
+    # Spaces with ids that lie on others are faults of a map.
+    is_outline = kind and is_alike and not element.is_node and not (kind == "parking_space" and named)
+    return (kind, _corners(element.lines)) if is_outline else element.id
+
+
+def _corners(lines: Iterable[FloatArray]) -> frozenset[tuple[float, ...]]:
+    return frozenset(tuple(p) for line in lines for p in line.round(7).tolist())
+
+
+def _union(group: list[tuple[OsmElement, _Preference]]) -> OsmElement:
+    if len(group) == 1:
+        return group[0][0]
+    group = sorted(group, key=lambda pair: pair[1])
+    best = group[0][0]
+    lines: list[FloatArray] = []
+    # The newest: of a street its parts, of an area the fullest outline.
+    for line in (line for e, p in group if p[1] == group[0][1][1] for line in e.lines):
+        if not _corners([line]) <= _corners(lines):
+            lines = [other for other in lines if not _corners([other]) <= _corners([line])] + [line]
+    if "highway" not in best.tags and any(
+        e.id == best.id and p[1] == group[0][1][1] and _corners(e.lines).isdisjoint(_corners(best.lines))
+        for e, p in group
+    ):
+        raise InputError(f"{best.id} appears twice, at different positions")
+    if "highway" not in best.tags and best.is_closed:
+        lines = list(max((e.lines for e, _ in group), key=lambda own: sum(map(len, own))))
+    name = next((e.id for e, _ in group if OSM_ID.fullmatch(e.id)), best.id)
+    return replace(best, id=name, lines=tuple(lines), holes=max((e.holes for e, _ in group), key=len))
+
+
+def _parted_levels(elements: list[OsmElement]) -> list[OsmElement]:
+    """Move the points of streets that cross others of another level at a common position, but do not end there."""
+    arms: dict[tuple[float, ...], Counter[int]] = defaultdict(Counter)
+    for e in elements:
+        for line in e.lines if "highway" in e.tags and not e.is_node else ():
+            for i, point in enumerate(map(tuple, line.tolist())):
+                arms[point][level_of(e.tags)] += 1 + (0 < i < len(line) - 1)
+    crossed = {p: min(own, key=abs) for p, own in arms.items() if len(own) > 1 and min(own.values()) > 1}
+    if not crossed:
+        return elements
+
+    def moved(line: FloatArray, level: int) -> FloatArray:
+        away = [level != crossed.get(point, level) for point in map(tuple, line.tolist())]
+        return line + np.outer(away, (0.0, _APART * level))
+
+    return [
+        replace(e, lines=tuple(moved(line, level_of(e.tags)) for line in e.lines))
+        if "highway" in e.tags and not e.is_node
+        else e
+        for e in elements
+    ]
+
+
+def level_of(tags: Mapping[str, str]) -> int:
+    """Return the level of a way: its layer, else 1 for bridges, -1 for tunnels, 0 for others."""
+    with suppress(ValueError):
+        return (
+            int(float(tags["layer"])) if "layer" in tags else _is_on(tags, "bridge") - _is_on(tags, "tunnel")
+        )
+    return 0
+
+
+def _is_on(tags: Mapping[str, str], key: str) -> int:
+    return tags.get(key, "no") not in ("no", "building_passage", "culvert")
+
+
+# ---- Overpass JSON, and XML with positions in place of nodes (`out geom`) ----
+
+
+def _map_of_overpass(elements: list[Any]) -> OsmMap:
+    raw = _RawElements()
+
+    def refs_of(name: str, given: dict[str, Any]) -> list[Member]:
+        refs, geometry = given.get("nodes"), given.get("geometry") or []
+        points = [_position(name, p.get("lat"), p.get("lon")) if p else BEYOND for p in geometry]
+        if not isinstance(refs, list) or (points and len(refs) != len(points)):
+            refs = points
+        raw.positions.update({ref: p for ref, p in zip(refs, points, strict=False) if p is not BEYOND})
+        return [Member(ref) for ref in refs]
+
+    for kind, add in (("relation", raw.add_relation), ("way", raw.add_way), ("node", raw.add_node)):
+        for index, given in enumerate(elements):
+            if not isinstance(given, dict) or type(given.get("id")) is not int:
+                raise InputError(f"elements[{index}] is {given!r:.40}, want an object with type and id")
+            if given.get("type") != kind:
+                continue
+            name, tags = f"{kind}/{given['id']}", tags_of_feature({"tags": given.get("tags") or {}})
+            try:
+                members = [
+                    Member(m["ref"], m["type"][:1], m.get("role", "")) for m in given.get("members", ())
+                ]
+                nodes = refs_of(name, given)
+                more = [(m, refs_of(name, m)) for m in given.get("members", ()) if m.get("geometry")]
+            except (AttributeError, KeyError, TypeError) as error:
+                raise InputError(
+                    f"{name}: want members, nodes and geometry as Overpass writes them"
+                ) from error
+            at = Location(given.get("lat"), given.get("lon"))
+            add(Answer(given["id"], given.get("version") or 0, tags, nodes, members, at))
+            for member, line in more:
+                if member["ref"] in raw.needed_ways:
+                    raw.add_way(Answer(member["ref"], -1, {}, line))
+            for m in given.get("members", ()):
+                if m["type"] == "node" and "lat" in m and m["ref"] in raw.needed_nodes:
+                    raw.positions.setdefault(m["ref"], _position(name, m["lat"], m["lon"]))
+    return raw.map()
 
 
 def _feature_element(
@@ -410,11 +601,7 @@ def _feature_element(
     if not isinstance(feature, dict):
         raise InputError(f"features[{index}] is {feature!r:.40}, want a GeoJSON feature")
     properties = feature["properties"] if _is_object(feature, "properties") else {}
-    ids = (properties.get("@id"), feature.get("id"), properties.get("id"))
-    known = (given for given in ids if isinstance(given, str) and OSM_ID.fullmatch(given))
-    name = next(known, f"feature/{index}")
-    values = properties["tags"] if _is_object(properties, "tags") else properties
-    tags = {str(key): str(value) for key, value in values.items() if isinstance(value, str | int | float)}
+    name, tags = id_of_feature(feature, properties) or f"feature/{index}", tags_of_feature(properties)
     geometry = feature["geometry"] if _is_object(feature, "geometry") else {}
     coordinates = geometry.get("coordinates")
 

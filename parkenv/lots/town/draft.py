@@ -78,6 +78,7 @@ from parkenv.world.tariff import PUBLIC
 ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
+SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
 RESERVED_PLACES = ("disabled", "charging")
 """Classes of users whose places a car park may count apart: `capacity:disabled`, `capacity:charging`."""
 PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
@@ -149,6 +150,7 @@ class _TownImport(MapImport):
     def __init__(self, name: str, place: OsmMap, left_hand: bool) -> None:
         # What an extract's edge cuts may have lost its nodes, too.
         elements = [e.closed() if is_parking_area(e) and not e.is_node else e for e in place.elements]
+        elements = _with_nodes_in_areas(elements)
         streets = [e for e in elements if "highway" in e.tags and not e.is_node]
         if not streets:
             raise InputError("no street in it, want ways with the tag highway")
@@ -419,6 +421,30 @@ class _TownImport(MapImport):
         found = (*_findings(self, rows, draft), *turns.found, *self.place.cut_elements())
         guesses = tuple(_guesses(rows, draft))
         return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows)
+
+
+def _with_nodes_in_areas(elements: Sequence[OsmElement]) -> list[OsmElement]:
+    """Return elements without nodes of car parks that their areas are, too, which have the tags of both.
+
+    A node is another car park if both have a name, or both a kind, and these differ.
+    """
+    parking = [(i, e) for i, e in enumerate(elements) if is_parking_area(e) and e.lines]
+    nodes = [(i, e) for i, e in parking if e.is_node]
+    areas = [(i, e) for i, e in parking if not e.is_node and e.is_closed]
+    if not nodes or not areas:
+        return list(elements)
+    shapes = [shapely.make_valid(shapely.MultiPolygon([(r, []) for r in e.lines])) for _, e in areas]
+    pairs = shapely.STRtree(shapes).query([shapely.Point(e.lines[0][0]) for _, e in nodes], "intersects").T
+    merged: list[OsmElement | None] = list(elements)
+    for k, area in pairs.tolist():
+        (own, node), (i, whole) = nodes[k], areas[area]
+        same = all(
+            node.tags.get(key, value) == value for key, value in whole.tags.items() if key in SAME_TAGS
+        )
+        if same and merged[own] is not None:
+            merged[own] = None
+            merged[i] = replace(whole, tags={**node.tags, **(merged[i] or whole).tags})
+    return [e for e in merged if e is not None]
 
 
 def _unseen_garages(
