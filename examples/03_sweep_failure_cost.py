@@ -1,7 +1,7 @@
 """How bold should the planner be? Vary what it believes a failed attempt to cost, in the same worlds.
 
 The world charges 10 s all along. `parkenv compare --failure-cost sweep` varies both: what the world charges, and with
-it what planners believe.
+it what planners believe. Rows come at the end.
 """
 
 import parkenv
@@ -9,6 +9,7 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import rows_of
 from parkenv.studies.workers import SERIAL
 
+print("100 searches ...", flush=True)
 agents = [AgentSpec(name="mdp", failure_s=failure_s) for failure_s in (10.0, 1.0, 5.0, 30.0, 90.0)]
 print("total s   minus the first [95 %]   driven m   walked m   agent")
 for row in rows_of(agents, parkenv.make_scenario("jam"), range(20), SERIAL):

@@ -2,6 +2,7 @@
 
 A lot of one's own, surveyed through simulated sensors on three days; then agents search there on new days: with the
 map, and with a map that says of every slot that half of the time it is taken. All meet the same cars.
+A line says when the survey begins, and when the searches do.
 """
 
 import tempfile
@@ -22,7 +23,7 @@ from parkenv.world.occupancy.process import ConstantForecast
 
 lot = grid_lot(4, 20)
 world = make_scenario(lot, arrival=ArrivalWindow.parse("11:00-13:00"))
-print(f"{lot.n_slots} slots")
+print(f"{lot.n_slots} slots; surveying on 3 days ...", flush=True)
 
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "map.sqlite"
@@ -42,6 +43,7 @@ maps = {
     "3 drives": map_prior(log, (), lot.walk_m(world.goal)),
     "the truth": None,
 }
+print("searching ...", flush=True)
 totals = {}
 for name, prior in maps.items():
     for agent in ("first-free", "mdp", "belief"):
