@@ -1,8 +1,8 @@
 """Read OpenStreetMap files: nodes, ways and multipolygons with their tags and positions.
 
-Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `[out:xml]`), packed as `.gz` and
-`.bz2`, too, and PBF, both by the package osmium; and GeoJSON as overpass-turbo and osmtogeojson write it (an element's
-id in `id` or `@id`, its tags in `properties` or `properties.tags`). GeoJSON of polygons without any such tag holds
+Four formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `[out:xml]`), packed as `.gz` and
+`.bz2`, too, and PBF, both by the package osmium; GeoJSON as overpass-turbo and osmtogeojson write it (an element's
+id in `id` or `@id`, its tags in `properties` or `properties.tags`; `export_tags` has other exporters); and Overpass JSON. GeoJSON of polygons without any such tag holds
 outlines of parking spaces.
 
 Extracts are clipped: ways lack the nodes beyond the edge, multipolygons some of their ways. Streets are cut there,
@@ -465,7 +465,7 @@ def _preference(feature: Any, element: OsmElement) -> _Preference:
     meta = properties.get("meta")
     version = properties.get("@version", meta.get("version") if isinstance(meta, dict) else None)
     is_area = str(feature["geometry"]["type"]).endswith("Polygon") and "highway" in element.tags
-    return is_area, -int(version) if str(version).isdecimal() else 0, -len(element.tags)
+    return is_area, -int(str(version)) if str(version).isdecimal() else 0, -len(element.tags)
 
 
 def _each_once(pairs: Sequence[tuple[OsmElement, _Preference]]) -> list[OsmElement]:

@@ -30,7 +30,7 @@ def id_of_feature(feature: dict[str, Any], properties: dict[str, Any]) -> str | 
     kind = next((t[0] for t in types if t in ("node", "way", "relation", "area")), None)
     shape = (feature.get("geometry") or {}).get("type") if "osm_id" in properties else None
     kind = kind or {"Point": "n", "LineString": "w", "Polygon": "r", "MultiPolygon": "r"}.get(str(shape))
-    number = next((int(v) for v in given if re.fullmatch(r"-?\d+", str(v))), None)
+    number = next((int(str(v)) for v in given if re.fullmatch(r"-?\d+", str(v))), None)
     if re.fullmatch(r"-?\d+", str(properties.get("osm_way_id"))):
         return f"way/{properties['osm_way_id']}"
     return None if kind is None or number is None else _name_of(kind, number)
