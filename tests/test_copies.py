@@ -186,3 +186,31 @@ def test_a_batch_goes_on_from_a_state_in_which_searches_have_ended(mode, observa
     for each in made:
         each.set_state(saved)
         assert go_on(each) == wanted
+
+
+@pytest.mark.parametrize("make", [single, lambda: gym.make("parkenv/Drive-v1").unwrapped])
+def test_a_saved_state_has_the_seed_of_the_episodes_to_come(make):
+    env, other = make(), make()
+    env.reset(seed=7)
+    saved = pickle.loads(pickle.dumps(env.get_state()))
+    wanted = parts(env.reset())
+    other.reset(seed=1)
+    for each in (env, other):
+        each.set_state(saved)
+        assert parts(each.reset()) == wanted
+
+
+@pytest.mark.parametrize(("seed", "parked"), [(0, True), (11, False)])
+def test_the_belief_of_a_search_that_is_over_samples_no_search_that_goes_on(seed, parked):
+    env, over, memory = single(), False, None
+    model, agent = parkenv.model(env.scenario), parkenv.make_agent("first-free", env.scenario)
+    observation, _ = env.reset(seed=seed)
+    belief = model.initial_belief(observation)
+    while not over:
+        action, memory = agent.predict(observation, memory)
+        observation, _, over, _, info = env.step(action)
+        belief = model.update(belief, int(action), observation)
+        states = model.sample(belief, np.random.default_rng(0), 5)
+        assert states.over.tolist() == [over] * 5
+    assert info["parked"] == parked
+    assert states.step(np.full(5, 3))[0].tolist() == [0.0] * 5

@@ -346,6 +346,9 @@ class DriveState:
     movers: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     # x, y in m and yaw in rad of the rear axle after each step
     trail: list[tuple[float, float, float]] = field(default_factory=list)
+    seeding: tuple[
+        Any, ...
+    ] = ()  # of a saved state: the environment's generator of random numbers, and its seed
 
     def __deepcopy__(self, memo: dict[int, Any]) -> DriveState:
         twin = copy.copy(self)  # a task never changes

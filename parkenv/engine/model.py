@@ -89,6 +89,7 @@ class Belief:
     n_steps: int  # number of steps so far
     _days: _Days
     _tables: ScenarioRecords
+    over: bool = False  # whether the car has parked, or has observed that every slot is taken
 
 
 class _Days(NamedTuple):
@@ -242,7 +243,7 @@ class Model:
         return Belief(vertex, slots, day, slots.observed_taken, float(now - elapsed), 0, days, tables)
 
     def sample(self, belief: Belief, rng: np.random.Generator, n: int = 1, copies: int = 1) -> Simulations:
-        """Draw n worlds from a belief, with a search that goes on in each.
+        """Draw n worlds from a belief, with a search in each; it goes on unless the belief is `over`.
 
         With `copies`, simulations i, n + i, 2n + i, ... are in the same world i, to compare what they do there.
 
@@ -271,6 +272,7 @@ class Model:
             np.exp(level)[rows], slope[rows], slots, taken[rows], n_observed, belief.last_taken[slots],
             belief.slots.p_observed[slots], belief.slots.observed_at[slots],
         )  # fmt: skip
+        drawn.searches.records["over"] = belief.over
         return drawn
 
     def step(
@@ -317,8 +319,15 @@ class Model:
         # Of the whole step, as in the environment: `decay` has dropped that of an attempt.
         after.observations = Observations(slots, times, taken, *rates)
         day.update(after.observations)
+        over = belief.over or bool(last_taken.all()) or (attempts == 1 and not taken[0])
         return replace(
-            belief, vertex=vertex, slots=after, day=day, last_taken=last_taken, n_steps=belief.n_steps + 1
+            belief,
+            vertex=vertex,
+            slots=after,
+            day=day,
+            last_taken=last_taken,
+            n_steps=belief.n_steps + 1,
+            over=over,
         )
 
     def observation_probability(

@@ -232,7 +232,9 @@ length and width over the car's |
         return self.state.task
 
     def get_state(self) -> tuple[int, DriveState]:
-        return self._episode, copy.deepcopy(self.state)
+        state = copy.deepcopy(self.state)
+        state.seeding = copy.deepcopy((self._np_random, self._np_random_seed))
+        return self._episode, state
 
     def set_state(self, state: tuple[int, DriveState]) -> None:
         episode, episode_state = state
@@ -243,6 +245,8 @@ length and width over the car's |
                 f"state has {len(episode_state.clocks)} road users, this environment {self._n_movers}"
             )
         self._episode, self._state = episode, copy.deepcopy(episode_state)
+        if episode_state.seeding:
+            self._np_random, self._np_random_seed = copy.deepcopy(episode_state.seeding)
         self._enter(self._state)
 
     def reset(

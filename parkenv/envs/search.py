@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -49,6 +50,7 @@ _REBUILT = {
 class SavedSearch(NamedTuple):
     arrays: tuple[NDArray[Any], ...]
     path: list[int]
+    seeding: tuple[Any, ...] = ()  # the environment's generator of random numbers, and its seed
 
 
 class SearchEnv(gym.Env[dict[str, Any], np.int64]):
@@ -265,7 +267,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._state
 
     def get_state(self) -> SavedSearch:
-        return SavedSearch(self.searches.save(), list(self.state.path))
+        seeding = deepcopy((self._np_random, self._np_random_seed, self._seeded_with))
+        return SavedSearch(self.searches.save(), list(self.state.path), seeding)
 
     def set_state(self, state: SavedSearch) -> None:
         """Continue from a state returned by `get_state` of an environment with the same scenario.
@@ -273,6 +276,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         The world is part of it: what follows is the true future once more. Plan with `parkenv.model`, not with this.
         """
         self.searches.restore(state.arrays)
+        if state.seeding:
+            self._np_random, self._np_random_seed, self._seeded_with = deepcopy(state.seeding)
         self._state.path = list(state.path)
         self._enter_scenario()
         self._step = self._stepper()

@@ -17,6 +17,9 @@ class Window:
         self._screen: Any = None
         self._ticker: Any = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Window, (self._title,)  # a copy is not open
+
     def show(self, frame: NDArray[np.uint8], fps: float) -> None:
         """Show a frame, (h, w, 3), at most `fps` frames per second.
 
