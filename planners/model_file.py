@@ -300,8 +300,8 @@ class Normalization:
         names = [key for key in tensors if key.split(".")[0] == _NORMALIZATION]
         given = {name: tensors.pop(name).double().numpy() for name in names}
         shapes = {_NORMALIZATION: (2,)} | {
-            f"{_NORMALIZATION}.{key}": (2, *box.shape) for key, box in space.items()
-        }  # type: ignore[misc]
+            f"{_NORMALIZATION}.{key}": (2, *(box.shape or ())) for key, box in space.items()
+        }
         for name, values in given.items():
             if values.shape != shapes.get(name) or (values[1] < 0.0).any() or _NORMALIZATION not in given:
                 raise ValueError(f"{name} is no {shapes.get(name)} array of statistics")
