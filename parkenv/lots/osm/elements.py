@@ -2,9 +2,8 @@
 
 Four formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `[out:xml]`), packed as `.gz` and
 `.bz2`, too, and PBF, both by the package osmium; GeoJSON as overpass-turbo and osmtogeojson write it (an element's
-id in `id` or `@id`, its tags in `properties` or `properties.tags`; `export_tags` has others); and Overpass JSON. GeoJSON of
-polygons without any such tag holds
-outlines of parking spaces.
+id in `id` or `@id`, its tags in `properties` or `properties.tags`; `export_tags` has others); and Overpass JSON.
+GeoJSON of polygons without any such tag holds outlines of parking spaces.
 
 Extracts are clipped: ways lack the nodes beyond the edge, multipolygons some of their ways. Streets are cut there,
 areas are closed by a straight line between what is left, and what has nothing left is listed.
