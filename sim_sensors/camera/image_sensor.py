@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array
@@ -165,7 +164,7 @@ def _streaks(
                     radiance[y, x, channel] += strength[i]
 
 
-@compiled(parallel=True, fastmath=FAST, nogil=True)
+@compiled(fastmath=FAST, nogil=True)
 def _expose(
     radiance: Float32Array,
     noise: Float32Array,
@@ -181,7 +180,7 @@ def _expose(
     n = 3 * width
     flat = radiance.reshape(height, n)
     codes = image.reshape(height, n)
-    for task in prange(order.shape[0]):
+    for task in range(order.shape[0]):
         # The row, blurred from top to bottom, with a pixel more at both ends.
         padded = np.empty(n + 6, dtype=np.float32)
         for y in range(order[task] * BAND, min(height, order[task] * BAND + BAND)):

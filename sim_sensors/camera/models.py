@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, FloatArray
@@ -336,7 +335,7 @@ def _vehicle_around(scene: Drawable, point: FloatArray) -> int:
     return int(instances.ids[near[np.argmax(inside)]]) if inside.any() else 0
 
 
-@compiled(parallel=True, nogil=True)
+@compiled(nogil=True)
 def _geometry(
     visibility: Visibility, instance: NDArray[np.int32], ids: NDArray[np.int32]
 ) -> tuple[Float32Array, Float32Array, NDArray[np.int32]]:
@@ -346,7 +345,7 @@ def _geometry(
     seen = np.empty((height, width), dtype=np.int32)
     infinite = np.float32(np.inf)
     one = np.float32(1.0)
-    for y in prange(height):
+    for y in range(height):
         for x in range(width):
             inverse = visibility.inverse_depth[y, x]
             depth[y, x] = one / inverse if inverse > 0 else infinite

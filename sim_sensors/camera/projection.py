@@ -12,7 +12,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
@@ -21,7 +20,6 @@ from sim_sensors.camera.textures import FAST, LEAF
 from sim_sensors.mesh import Instances, Material, MeshArrays, MeshPool
 
 NEAR = 0.05  # m; nothing nearer is drawn
-_MOST_PARTS = 8
 
 # Materials of closed objects, whose inside is never visible. A car's shell is not closed: its inside is visible through
 # the windows.
@@ -104,20 +102,12 @@ def project(
         np.empty((capacity, 3), dtype=np.uint8),
         np.empty(capacity, dtype=np.int32),
     )
-    # Each thread takes instances with about as many triangles as the others'.
-    parts = min(get_num_threads(), _MOST_PARTS)
-    share = np.searchsorted(room, np.linspace(0, capacity, parts + 1)[1:-1])
-    begin = np.concatenate([[0], share, [len(visible)]]).astype(np.int64)
-    end = room[begin[:-1]]
+    begin, end = np.array([0, len(visible)]), np.zeros(1, np.int64)
     camera = _Camera(np.ascontiguousarray(pose, dtype=np.float64), *intrinsics, *size)
     _project_parts(
         pool.arrays, _Placed(visible, mesh, instances.pose), camera, begin, end, most_vertices, out
     )
     count = int(end[0])
-    for first, last in zip(room[begin[1:-1]].tolist(), end[1:].tolist(), strict=True):
-        for column in out:
-            column[count : count + last - first] = column[first:last]
-        count += last - first
     return ScreenTriangles._make(column[:count] for column in out)
 
 
@@ -138,7 +128,7 @@ def _visible_instances(
     return np.flatnonzero(seen).astype(np.int32)
 
 
-@compiled(parallel=True, fastmath=FAST, nogil=True)
+@compiled(fastmath=FAST, nogil=True)
 def _project_parts(
     meshes: MeshArrays,
     placed: _Placed,
@@ -149,7 +139,7 @@ def _project_parts(
     out: ScreenTriangles,
 ) -> None:
     """Project instances `begin[k]` to `begin[k + 1]` into `out` from row `end[k]` on, and set that to the next row."""
-    for part in prange(end.shape[0]):
+    for part in range(end.shape[0]):
         work = _Work(
             np.empty((most_vertices, 5)),
             np.empty((3, 4)),

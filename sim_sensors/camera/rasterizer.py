@@ -11,7 +11,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
@@ -150,7 +149,7 @@ def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, fl
     return ax, ay, bx, by, cx, cy
 
 
-@compiled(parallel=True, fastmath=FAST, nogil=True)
+@compiled(fastmath=FAST, nogil=True)
 def _rasterize(
     corners: Float32Array,
     planes: FloatArray,
@@ -168,7 +167,7 @@ def _rasterize(
     n_panes: NDArray[np.uint8],
 ) -> None:
     height, width = depth.shape
-    for task in prange(order.shape[0]):
+    for task in range(order.shape[0]):
         band = order[task]
         top = band * BAND
         bottom = min(height, top + BAND)

@@ -7,7 +7,6 @@ of a kind are collected and shaded together.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
@@ -77,7 +76,7 @@ def shade(
     return image
 
 
-@compiled(parallel=True, fastmath=FAST, nogil=True)
+@compiled(fastmath=FAST, nogil=True)
 def _shade(
     triangles: ScreenTriangles,
     visibility: Visibility,
@@ -95,7 +94,7 @@ def _shade(
     image: Float32Array,
 ) -> None:
     height, width, _ = image.shape
-    for task in prange(order.shape[0]):
+    for task in range(order.shape[0]):
         # Assemble the tuples here: numba's parallel loops accept tuples from outside, but not nested ones.
         materials = Materials(grain, cloud, response, linear)
         room = _BATCH + width

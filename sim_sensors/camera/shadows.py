@@ -15,7 +15,6 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
-from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, FloatArray, Image, Int32Array
@@ -35,7 +34,6 @@ _WIDE, _TIGHT = 0.34 * _CONTACT_SCALE, 0.1 * _CONTACT_SCALE  # texels, the blurs
 _BLUR_REACH = 24  # texels; OpenCV cuts both blurs off before
 _KEPT = 6  # windows kept for the meshes of one lot
 _FEW = 12  # more changed instances than these, and the map is drawn anew
-_MOST_PARTS = 8  # of a shadow map, for as many threads
 _GLASS = int(Material.GLASS)
 
 _Box = Sequence[int]  # first and end row, first and end column, texels
@@ -198,14 +196,13 @@ def _cast(
         return
     mesh = _drawn_mesh(pool, rows)
     most_vertices = int((pool.vertex_start[mesh + 1] - pool.vertex_start[mesh]).max())
-    parts = min(get_num_threads(), _MOST_PARTS, bottom - top)
     _cast_parts(
         pool.arrays,
         mesh,
         np.ascontiguousarray(rows[:, 1:5]),
         boxes,
         to_shadow,
-        np.linspace(top, bottom, parts + 1).astype(np.int64),
+        np.array([top, bottom]),
         left,
         right,
         most_vertices,
@@ -213,7 +210,7 @@ def _cast(
     )
 
 
-@compiled(parallel=True, nogil=True, error_model="numpy")
+@compiled(nogil=True, error_model="numpy")
 def _cast_parts(
     meshes: MeshArrays,
     mesh: Int32Array,
@@ -227,7 +224,7 @@ def _cast_parts(
     shadow: Float32Array,
 ) -> None:
     """Cast the shadows on rows `begin[k]` to `begin[k + 1]` in one thread each; without `fastmath`, see the module."""
-    for part in prange(begin.shape[0] - 1):
+    for part in range(begin.shape[0] - 1):
         top, bottom = begin[part], begin[part + 1]
         p = np.empty((most_vertices, 3))
         for q in range(mesh.shape[0]):

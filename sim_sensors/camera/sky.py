@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft2
 
@@ -166,10 +165,10 @@ def packed_sky(weather: Weather) -> tuple[NDArray[np.uint32], np.float32]:
     return codes[..., 0] << 21 | codes[..., 1] << 10 | codes[..., 2], np.float32(brightest)
 
 
-@compiled(parallel=True, fastmath=FAST, nogil=True)
+@compiled(fastmath=FAST, nogil=True)
 def _fill_dome(sky: Sky, dome: Float32Array) -> None:
     n = dome.shape[0]
-    for row in prange(n):
+    for row in range(n):
         v = (row + 0.5) / n * 2.0 - 1.0
         for column in range(n):
             u = (column + 0.5) / n * 2.0 - 1.0
@@ -210,12 +209,12 @@ def _sky_of_view(
     return view
 
 
-@compiled(parallel=True, fastmath=FAST, nogil=True)
+@compiled(fastmath=FAST, nogil=True)
 def _fill_view(
     sky: Sky, rotation: FloatArray, fx: float, fy: float, cx: float, cy: float, view: Float32Array
 ) -> None:
     r = rotation
-    for y in prange(view.shape[0]):
+    for y in range(view.shape[0]):
         v = (y + 0.5 - cy) / fy
         for x in range(view.shape[1]):
             u = (x + 0.5 - cx) / fx
