@@ -155,10 +155,12 @@ GOOD = Tiny().model().SerializeToString()
         (crashes_opencv(), TOML, r"a\.onnx: OpenCV cannot run this network .* shape \(1, 3"),
         (unknown_operator(), TOML, r"a\.onnx: OpenCV cannot run this network"),
         (GOOD, 'channels = "grey"\n' + TOML, r"its input is 1 x 3 x 64 x 64, and size and channels in .*a\.toml"),
-        (GOOD, "cars = [0]", r"its input is 1 x 3 x 64 x 64, .* are for 1 x 3 x 640 x 640"),
-        (two_outputs(), TOML, r"a\.onnx: has the outputs .*, want one"),
-        (classifier(), TOML, r"puts out \(1, 12288\), want \(1, 4 \+ classes, n\) or .* a class of your own"),
-        (Tiny(is_transposed=True).model(), TOML, r"puts out \(1, 84, 7\), want \(1, 4 \+ classes, n\)"),
+        (GOOD, "cars = [0]\nsize = [96, 96]", r"its input is 1 x 3 x 64 x 64, .* are for 1 x 3 x 96 x 96"),
+        (two_outputs(), TOML, r"a\.onnx: puts out .*; write outputs = \['output0'\], or another"),
+        (two_outputs(), TOML + 'outputs = ["output1"]', r"a\.toml: outputs has 'output1'; did you .*output0, between"),
+        (two_outputs(), TOML + 'layout = "centers"', r"puts out .*, want \(1, 9, rows, columns\)"),
+        (classifier(), TOML, r"puts out class \(1, 12288\), want \(1, 4 \+ classes, n\) or .* a class of your own"),
+        (Tiny(is_transposed=True).model(), TOML, r"puts out output0 \(1, 84, 7\), want \(1, 4 \+ classes, n\)"),
         (GOOD, "size = [8, 8]", r"a\.toml: size\.0 is 8, want a number of at least 16"),
         (GOOD, "size = [64, 64]\ncars = [7]", r"a\.toml: cars has 7, want classes of the network, 0 to 2"),
         (GOOD, "size = [64, 64]", r"a\.onnx: has 3 classes; write cars = \[indices from 0\] in .*a\.toml"),
@@ -172,6 +174,30 @@ def test_what_is_no_detector_is_refused_in_a_line(tmp_path, content, settings, m
     with pytest.raises(InputError, match=message) as caught:
         make_detector(str(tmp_path / "a.onnx"))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "outputs", [["output0"], ["output0", "between"], ["masks", "output0"], ["masks", "between"]]
+)
+def test_one_of_several_outputs_is_read(tmp_path, outputs):
+    """The file's size counts, where none is set; rows of mask coefficients are no classes."""
+    model = two_outputs()
+    given = numpy_helper.from_array(np.zeros((1, 2, 16, 16), np.float32), "masks")
+    model.graph.node.append(helper.make_node("Constant", [], ["masks"], value=given))
+    model.graph.output.append(helper.make_tensor_value_info("masks", TensorProto.FLOAT, [1, 2, 16, 16]))
+    (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
+    (tmp_path / "a.toml").write_text(f'layout = "yolo"\noutputs = {json.dumps(outputs)}\nthreshold = 0.01\n')
+    detector = make_detector(str(tmp_path / "a.onnx"))
+    assert detector._size == (64, 64)
+    (tmp_path / "b.onnx").write_bytes(GOOD)
+    (tmp_path / "b.toml").write_text("cars = [0]\nthreshold = 0.01\n")
+    wanted = make_detector(str(tmp_path / "b.onnx")).detect(photo())
+    found = detector.detect(photo())
+    if "output0" in outputs:
+        np.testing.assert_array_equal(found.boxes, wanted.boxes)
+        np.testing.assert_array_equal(found.probability, wanted.probability)
+    else:  # before boxes are scaled to px
+        assert found.boxes[:, 2:].max() < wanted.boxes[:, 2:].max()
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,29 @@ def test_tables_and_tracks_say_the_same(tmp_path):
     np.testing.assert_allclose(track.headings(positions), metres.headings(metres.positions), atol=1e-3)
 
 
+def test_no_heading_is_made_across_a_gap(tmp_path):
+    """East, then after a gap far away north: in segments, by time alone, or by a column; one lone point has none."""
+    frame = LocalFrame(7.85, 48.0)
+    parts = [[(3.0 * k, 0.0) for k in range(6)], [(50.0, 80.0)], [(90.0, 60.0 + 3.0 * k) for k in range(6)]]
+    for gap in (1, 60):
+        rows = [
+            (60 * 0 + k + gap * i, i, *p) for i, part in enumerate(parts) for k, p in enumerate(part, 6 * i)
+        ]
+        segments = {0: "", 1: "", 2: ""}
+        table = [("time", "x", "y", "segment") if gap == 1 else ("time", "x", "y", "speed")]
+        for second, i, x, y in rows:
+            time = f"2026-05-04T09:{second // 60:02d}:{second % 60:02d}Z"
+            (lon, lat), *_ = frame.to_lonlat(np.array([[x, y]]))
+            segments[i] += POINT.format(lat, lon, time)
+            table.append((time, x, y, i if gap == 1 else 3))
+        (tmp_path / "t.gpx").write_text(GPX.format("</trkseg><trkseg>".join(segments.values())))
+        write_rows(tmp_path / "t.csv", table)
+        wanted = [0.0] * 6 + [math.nan] + [math.pi / 2] * 6
+        for track in (read_track(tmp_path / "t.gpx"), read_track(tmp_path / "t.csv")):
+            xy = frame.to_xy(track.positions) if track.in_degrees else track.positions
+            np.testing.assert_allclose(track.headings(xy), wanted, atol=1e-3)
+
+
 ENTITIES = "".join(f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">' for k in range(9))
 BOMB = f'<!DOCTYPE gpx [<!ENTITY a "aaaaaaaaaa">{ENTITIES}]><gpx>&j;</gpx>'
 

@@ -2,19 +2,21 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-from command_line import parkenv, ran
+from command_line import parkenv, ran, summary_of
 
 from parkenv import InputError, make_scenario
 from parkenv.files.recordings import footage_in
 from parkenv.files.videos import Video
 from parkenv.mapping.drive_calibration import DriveCalibration
+from parkenv.mapping.laser_scans import common_scanner, scan_of
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.mapping.photographs import Photographs
-from parkenv.mapping.recorded_drive import Head, RecordedDrive, recording
+from parkenv.mapping.recorded_drive import Head, RecordedDrive, _pose_of, recording
 from parkenv.mapping.store import MapStore
 from sim_sensors.camera.models import Frame
 from sim_sensors.rig import Capture, SensorRig, TimedCapture
@@ -175,7 +177,8 @@ def test_cars_are_searched_in_the_pictures_of_a_recording(tmp_path):
     (film,) = (tmp_path / "found").glob("*_camera_cars.mp4")
     video = Video.of(film)
     assert (video.width, video.height, video.frames, video.fps) == (WIDTH, HEIGHT, 3, pytest.approx(2.5))
-    (footage,) = footage_in(tmp_path / "drives/bag")
+    (footage,), others = footage_in(tmp_path / "drives/bag")
+    assert others == {}
     frames = list(footage.read())
     assert [frame.time for frame in frames] == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8])
     for k, frame in enumerate(frames):
@@ -183,6 +186,123 @@ def test_cars_are_searched_in_the_pictures_of_a_recording(tmp_path):
     blind = bag(tmp_path / "blind", pictures=0)
     with pytest.raises(InputError, match=r"blind.*: has no pictures, want sensor_msgs/msg/Image or .*/scan"):
         footage_in(blind)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "reason"),
+    [
+        ("16UC1", "encoding is '16UC1', want rgb8"),
+        ("bayer_rggb8", "encoding is 'bayer_rggb8', want rgb8"),
+        ("h264", "format is 'h264', want a picture of 8 bits"),
+        ("16UC1; compressedDepth png", "want a picture of 8 bits"),
+        ("bayer_rggb8; png compressed bayer_rggb8", "want a picture of 8 bits"),
+        ("bayer_rggb8; png compressed bgr8", None),
+    ],
+)
+def test_topics_that_are_no_pictures_in_colour_are_listed(tmp_path, encoding, reason):
+    (tmp_path / "bag").mkdir()
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t, raw = store.types, len(encoding) in (5, 11)
+    with Writer(tmp_path / "bag/bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        header = t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](1, 0), "")
+        data = cv2.imencode(".png", image(0))[1].ravel()
+        color = t["sensor_msgs/msg/CompressedImage"](header, "jpeg", data)
+        other = color.__class__(header, encoding, data)
+        if raw:
+            other = t["sensor_msgs/msg/Image"](header, 4, 4, encoding, 0, 8, np.zeros(32, np.uint8))
+        for topic, message in (("/depth", other), ("/color", color)):
+            connection = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            writer.write(connection, 10**9, store.serialize_cdr(message, message.__msgtype__))
+        writer.add_connection("/silent", color.__msgtype__, typestore=store)
+    done = ran("detect", tmp_path / "bag/bag", "--out", tmp_path / "found")
+    topics = {
+        row["file"].split(":")[1]: row["reason"] for row in summary_of(tmp_path / "found")["not_searched"]
+    }
+    assert topics.pop("/silent") == "has no messages"
+    assert "/color: 1 frame" in done.stdout
+    assert list(topics) == (["/depth"] if reason else [])
+    assert reason is None or reason in topics["/depth"]
+
+
+def laser_scan(start, step, ranges, low=0.0, high=30.0):
+    end = start + step * (len(ranges) - 1)
+    return SimpleNamespace(
+        angle_min=start, angle_max=end, angle_increment=step, range_min=low, range_max=high, ranges=ranges
+    )
+
+
+def test_each_scan_is_read_with_its_own_angles():
+    def measured(start, step, n):
+        angle = start + step * np.arange(n)
+        return laser_scan(
+            start, step, np.round(20.0 + np.degrees(angle) / 20.0, 4)
+        )  # the range says the angle
+
+    rad = math.radians
+    messages = [
+        measured(rad(-90), rad(1), 181),
+        measured(rad(-80), rad(1), 171),  # begins later
+        measured(rad(90), rad(-1), 181),  # clockwise
+        measured(rad(-100), rad(1), 201),  # wider
+        measured(rad(-90), rad(1), 180),  # a beam less
+    ]
+    scans = [scan_of(message) for message in messages]
+    scanner, ranges = common_scanner(scans)
+    assert (scanner.n_beams, scanner.start, scanner.step) == (
+        201,
+        pytest.approx(rad(-100)),
+        pytest.approx(rad(1)),
+    )
+    for scan, _message, row in zip(scans, messages, ranges, strict=True):
+        hit = np.isfinite(row)
+        assert hit.sum() >= len(scan.ranges)
+        off = np.abs(row - (20.0 + np.degrees(scanner.angles) / 20.0))[hit]
+        assert off.max() <= 0.025 + 1e-3  # half a beam of the finest scan
+    with pytest.raises(InputError, match=r"beams 0\.0174533 and 0\.0349066 rad apart, want one"):
+        common_scanner([*scans, scan_of(measured(rad(-90), rad(2), 91))])
+    alone, (same,) = common_scanner(scans[:1])
+    assert alone.n_beams == 181
+    np.testing.assert_array_equal(same, scans[0].ranges)
+
+
+@pytest.mark.parametrize("n", [360, 720, 1080, 2910, 1459])
+@pytest.mark.parametrize("more", [-1, 0, 1, 2])
+def test_a_full_turn_may_have_both_ends(n, more):
+    step = float(np.float32(2 * math.pi / n))
+    message = laser_scan(float(np.float32(-math.pi)), step, np.full(n + more, 5.0))
+    scanner, (ranges,) = common_scanner([scan_of(message)])
+    assert scanner.n_beams == len(ranges) == min(n, n + more)
+    message.ranges = np.full(n + 9, 5.0)
+    with pytest.raises(InputError, match=rf"a scan has {n + 9} beams .* want {n} at most, a full turn"):
+        scan_of(message)
+
+
+def test_limits_are_no_hits():
+    ranges = np.array([0.0, 0.05, 0.1, 29.99, 30.0, 31.0, np.inf, np.nan, -1.0], np.float32)
+    wanted = [False, True, True, True, False, False, False, False, False]
+    assert np.isfinite(scan_of(laser_scan(0.0, 0.1, ranges)).ranges).tolist() == wanted
+    wanted[1] = False
+    assert np.isfinite(scan_of(laser_scan(0.0, 0.1, ranges, low=0.1)).ranges).tolist() == wanted
+    for broken in ({"step": 0.0}, {"high": math.nan}, {"start": math.inf}, {"low": math.nan}):
+        with pytest.raises(InputError, match="want numbers, an increment other than 0"):
+            scan_of(laser_scan(**{"start": 0.0, "step": 0.1, "ranges": ranges} | broken))
+
+
+@pytest.mark.parametrize("norm", [0.9, 1.0, 1.1])
+def test_orientations_of_any_near_norm_say_the_same_heading(norm):
+    for yaw in np.linspace(-3.1, 3.1, 9):
+        z, w = norm * math.sin(yaw / 2), norm * math.cos(yaw / 2)
+        at = SimpleNamespace(
+            position=SimpleNamespace(x=1.0, y=2.0), orientation=SimpleNamespace(x=0.0, y=0.0, z=z, w=w)
+        )
+        assert _pose_of(SimpleNamespace(pose=at)) == pytest.approx((1.0, 2.0, yaw))
+        for factor in (0.0, 0.2, 9.0, math.nan):
+            at.orientation.z, at.orientation.w = z * factor, w * factor
+            with pytest.raises(
+                InputError, match=r"its orientation has the norm .*, want a quaternion of norm 1"
+            ):
+                _pose_of(SimpleNamespace(pose=at))
+        at.orientation.z, at.orientation.w = z, w
 
 
 def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_path, monkeypatch):

@@ -93,6 +93,8 @@ class Detect(Command):
                 f"{video['file']}: {plural(video['frames'], 'frame')} of {video['seconds']:.1f} s, "
                 f"{plural(video['boxes'], 'box', 'boxes')}, at most {plural(video['most_cars'], 'car')} in a frame"
             )
+        for topic in cars.not_searched:
+            console.print(f"Not searched: {topic['file']}: {topic['reason']}")
         if self.out is not None:
             file, *sides, probability, view, visible = (column.key for column in BOX)
             rows = [
@@ -100,7 +102,7 @@ class Detect(Command):
                 | {key: box[key] for key in (probability, view, visible)}
                 for box in boxes
             ]
-            save_summary(self.out, None, rows, videos=cars.videos)
+            save_summary(self.out, None, rows, videos=cars.videos, not_searched=cars.not_searched)
             console.print(f"Pictures, films, boxes.csv and summary.json are in {self.out}")
 
     def _finder(self) -> Detector:

@@ -202,7 +202,9 @@ def _own(content: Mapping[str, Any], path: Path, vehicle: VehicleParameters | No
     scene = _scene(path.stem, vehicle or given, spec.start, spec.target, contours, spec.bounds)
     crossings = []
     for user in spec.crossings:
-        crossing = Crossing(user.kind, user.way, user.speed_mps, user.begins_s)  # checked as in the file
+        crossing = Crossing(
+            user.kind, (user.way[0], user.way[1]), user.speed_mps, user.begins_s
+        )  # checked as in the file
         start, end = (tuple((np.array(point) - scene.origin).tolist()) for point in user.way)
         crossings.append(dataclasses.replace(crossing, way=(start, end)))
     return dataclasses.replace(scene, crossings=tuple(crossings))

@@ -4,6 +4,7 @@ import bz2
 import functools
 import io
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,6 +36,10 @@ MAX_MERGED_BYTES = 1_000_000_000
 """Maximum size, unpacked, of chunks that overlap in time, which are read at the same time."""
 MAX_GROWTH = 100
 """Maximum size of a packed file of a rosbag, unpacked, as a multiple of its own size, beside 1 MB."""
+_NO_PICTURE = re.compile(
+    r"(?i)16|32|64|mono16|bayer|h26|hevc|av1|vp9"
+)  # depth, a mosaic of colours, or a film
+_OTHER_PICTURES = re.compile(r"(?i)image|video|packet")  # in names of types of other transports of pictures
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 
 
@@ -169,7 +174,14 @@ def stamp_of(message: Any, recorded: int) -> int:
 
 def picture_in(message: Any, where: str) -> Image:
     """Return the picture of an image message, (h, w) grey or (h, w, 3) RGB, uint8."""
-    return decode_image(bytes(message.data), where) if hasattr(message, "format") else _raw(message, where)
+    if not hasattr(message, "format"):
+        return _raw(message, where)
+    packed = message.format.partition("compressed ")
+    if "compressedDepth" in message.format or _NO_PICTURE.match((packed[2] or packed[0]).strip()):
+        raise InputError(
+            f"{where}: format is {message.format!r:.60}, want a picture of 8 bits in colour or grey"
+        )
+    return decode_image(bytes(message.data), where)
 
 
 def _raw(message: Any, where: str) -> Image:
@@ -223,24 +235,39 @@ class Footage:
                 yield VideoFrame(number, last, image if image.ndim == 3 else np.stack([image] * 3, axis=2))
 
 
-def footage_in(path: Path) -> list[Footage]:
+def footage_in(path: Path) -> tuple[list[Footage], dict[str, str]]:
+    """Return the cameras of a recording, and topics with pictures that are not read, with the reason."""
     with open_recording(path) as (types, _):
-        topics = sorted(topic for topic, kind in types.items() if kind in (IMAGE, COMPRESSED_IMAGE))
-    cameras = []
-    for topic in topics:
+        topics = {
+            topic: kind
+            for topic, kind in sorted(types.items())
+            if _OTHER_PICTURES.search(kind.split("/")[-1])
+        }
+    cameras, others = [], dict[str, str]()
+    for topic, kind in topics.items():
+        if kind not in (IMAGE, COMPRESSED_IMAGE):
+            others[topic] = f"is a {kind}, want {IMAGE} or {COMPRESSED_IMAGE}"
+            continue
         pictures = _pictures(path, topic)
         start, message = next(pictures, (0, None))
         if message is None:
+            others[topic] = "has no messages"
             continue
-        height, width = picture_in(message, f"{path}: {topic}: image 1").shape[:2]
+        try:
+            height, width = picture_in(message, "image 1").shape[:2]
+        except InputError as error:
+            others[topic] = str(error)
+            continue
         stamps = [start, *(stamp for stamp, _ in pictures)]
         seconds = (stamps[-1] - stamps[0]) / 1e9
         fps = (len(stamps) - 1) / seconds if seconds > 0.0 else USUAL_FPS
         cameras.append(Footage(path, topic, width, height, fps, len(stamps)))
     if not cameras:
-        there = ", ".join(sorted(f"{topic} ({kind})" for topic, kind in types.items())[:12]) or "nothing"
-        raise InputError(f"{path}: has no pictures, want {IMAGE} or {COMPRESSED_IMAGE}; it has {there}")
-    return cameras
+        there = [f"{topic} ({others.get(topic, kind)})" for topic, kind in sorted(types.items())]
+        raise InputError(
+            f"{path}: has no pictures, want {IMAGE} or {COMPRESSED_IMAGE}; it has {', '.join(there[:12]) or 'nothing'}"
+        )
+    return cameras, others
 
 
 def _pictures(path: Path, topic: str) -> Iterator[tuple[int, Any]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER, TEXT, Kind, typed_records
 from parkenv.files.limited_reading import read_xml
@@ -16,6 +16,9 @@ MONDAY_S = 4 * 86_400  # 1970-01-05, the first Monday of Unix time, s
 _WEEK_S = 604_800  # smaller times are since Monday 00:00
 _UNIX_S = (1e8, 9e9)  # 1973 to 2255; nanoseconds fit 64 bits
 _STEP_M = 1.0  # between the positions of which a heading is made
+_GAP_S, _GAP_STEPS = 2.0, 3.0
+"""A gap in a track is longer than this, s, and than this multiple of the median time between two points."""
+_SEGMENT = ("track_fid", "track_seg_id", "segment")  # columns that say where a track is interrupted
 _WANT = "want columns time or file, x and y (m) or lat and lon (degrees), and yaw (rad) or heading (degrees) if known"
 
 
@@ -28,20 +31,28 @@ class Track:
     positions: FloatArray  # (n, 2) m in the lot, or degrees, longitude first
     in_degrees: bool  # which of the two
     yaw: FloatArray  # (n,) rad, counter-clockwise from east; NaN where it is not given
+    begins: BoolArray  # (n,) whether the track was interrupted before a position
 
     def headings(self, xy: FloatArray) -> FloatArray:
-        """Return the headings, (n,) rad: as given, else the direction from position to position, (n, 2) m."""
+        """Return the headings, (n,) rad: as given, else the direction from position to position, (n, 2) m.
+
+        They are made of positions of one part of the track, between interruptions; NaN in one of less than 2 m.
+        """
         if not np.isnan(self.yaw).any():
             return self.yaw
-        kept = [0]
-        for k in range(1, len(xy)):
-            if math.dist(xy[k], xy[kept[-1]]) >= _STEP_M:
-                kept.append(k)
-        if len(kept) < 3:
+        along = np.full(len(xy), np.nan)
+        for part in np.split(np.arange(len(xy)), np.flatnonzero(self.begins[1:]) + 1):
+            chosen = [int(part[0])]
+            for k in part[1:].tolist():
+                if math.dist(xy[k], xy[chosen[-1]]) >= _STEP_M:
+                    chosen.append(k)
+            step, middle = np.diff(xy[chosen], axis=0), 0.5 * (np.array(chosen[1:]) + chosen[:-1])
+            if np.hypot(*step.T).sum() >= 2.0 * _STEP_M:
+                along[part] = np.interp(part, middle, np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
+        yaw = np.where(np.isnan(self.yaw), along, self.yaw)
+        if np.isnan(yaw).all():
             raise InputError("has no headings, and its way of less than 2 m shows none")
-        step, middle = np.diff(xy[kept], axis=0), 0.5 * (np.array(kept[1:]) + kept[:-1])
-        along = np.interp(np.arange(len(xy)), middle, np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
-        return np.where(np.isnan(self.yaw), along, self.yaw)
+        return yaw
 
 
 def read_track(path: Path, timezone_s: float = 0.0) -> Track:
@@ -57,14 +68,18 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
     kinds = dict.fromkeys(("x", "y", "lat", "lon", "heading"), NUMBER) | {"time": time}
     kinds["yaw"] = Kind("radians, -6.3 to 6.3", _angle)
     if path.suffix.lower() == ".gpx":
-        points = read_xml(path, "gpx").iterfind(".//{*}trkpt")
-        texts = [p.attrib | {"time": (p.findtext("{*}time") or "").strip()} for p in points]
+        texts = [
+            p.attrib | {"time": (p.findtext("{*}time") or "").strip(), "segment": str(number)}
+            for number, segment in enumerate(read_xml(path, "gpx").iterfind(".//{*}trkseg"))
+            for p in segment.iterfind("{*}trkpt")
+        ]
         rows = []
         for number, point in enumerate(texts, 1):
             try:
-                rows.append({name: kinds[name].parse(point.get(name, "")) for name in ("time", "lat", "lon")})
+                row = {name: kinds[name].parse(point.get(name, "")) for name in ("time", "lat", "lon")}
+                rows.append(row | {"segment": point["segment"]})
             except ValueError as error:
-                shown = str(point)[:120]
+                shown = str({name: text for name, text in point.items() if name != "segment"})[:120]
                 raise InputError(
                     f"{path}: track point {number} is {shown}, want lat, lon and time"
                 ) from error
@@ -89,7 +104,11 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
         raise InputError(f"{path}: pose {off[0] + 1} is lon, lat {place}, want a place on the globe")
     turned = [row.get("yaw", math.pi / 2 - math.radians(row.get("heading", math.nan))) for row in rows]
     files = tuple(row["file"] for row in rows if "file" in has)
-    return Track(stamps, files, at, pair[0] == "lon", np.array(turned))
+    parts = [tuple(row.get(name) for name in _SEGMENT) for row in rows]
+    begins = np.array([k == 0 or part != parts[k - 1] for k, part in enumerate(parts)])
+    seconds = np.diff(stamps) / 1e9
+    begins[1:] |= seconds > max(_GAP_S, _GAP_STEPS * float(np.median(seconds)) if seconds.size else 0.0)
+    return Track(stamps, files, at, pair[0] == "lon", np.array(turned), begins)
 
 
 def stamp_in(text: str, timezone_s: float) -> int:

@@ -93,7 +93,8 @@ class Photographs:
         def messages(topics: set[str]) -> Iterator[tuple[str, int, Any]]:
             if pose in topics:
                 for stamp, (x, y, yaw) in zip(self.track.stamps.tolist(), self._poses.tolist(), strict=True):
-                    yield pose, stamp, SimpleNamespace(x=x, y=y, theta=yaw)
+                    if not math.isnan(yaw):  # pictures at one without a heading are left out
+                        yield pose, stamp, SimpleNamespace(x=x, y=y, theta=yaw)
             if picture in topics:
                 for stamp, message in self._pictures():
                     yield picture, stamp, message

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, naming
 from parkenv.files.atomic_write import atomic_write, check_writable
 from parkenv.files.limited_reading import parse_json
 from parkenv.files.recordings import (
@@ -38,6 +38,7 @@ from parkenv.files.recordings import (
 from parkenv.files.spec_file import Spec
 from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, Lens, StereoSpec
 from parkenv.mapping.grid import OccupancyGrid
+from parkenv.mapping.laser_scans import Scan, common_scanner, scan_of
 from parkenv.mapping.photographs import Photographs
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey import SessionMap, Survey
@@ -55,6 +56,7 @@ PAIR_S = 0.1  # longest time between a picture and what other sensors measured w
 GAP_S = 2.0  # longest time between two poses that a pose is interpolated between, s
 HEAD, POSE = "/parkenv/drive", "/pose"
 _MONDAY_S = 1_704_067_200  # 2024-01-01; drives are recorded as if in the week from this Monday on
+_NORMS = 0.5, 1.5  # of quaternions that are taken for rounded ones of norm 1, and normalised
 _STRING, _POSE_2D = "std_msgs/msg/String", "geometry_msgs/msg/Pose2D"
 _SCAN = "sensor_msgs/msg/LaserScan"
 _TYPES = {
@@ -178,6 +180,7 @@ class RecordedDrive:
         self._stamps: dict[str, list[int]] = {}
         self._scans: dict[str, list[NDArray[np.float32]]] = {}
         self._scanners: dict[str, LaserScanner] = {}
+        self._measured: dict[str, list[Scan]] = {}
         poses: list[tuple[float, float, float]] = []
         if self.photographs is not None:
             self.calibration = self.photographs.calibration
@@ -195,7 +198,8 @@ class RecordedDrive:
                 key = wanted[topic]
                 self._add_stamp(key, stamp_of(message, stamp))
                 if key == "pose":
-                    poses.append(_pose_of(message))
+                    with naming(f"{self.path}: {topic}: pose {len(poses) + 1}"):
+                        poses.append(_pose_of(message))
                 elif key.startswith("scan:"):
                     self._add_scan(key[5:], message)
         self._finish(np.array(poses, dtype=np.float64).reshape(-1, 3))
@@ -283,25 +287,8 @@ class RecordedDrive:
         before.append(stamp)
 
     def _add_scan(self, name: str, message: Any) -> None:
-        ranges = np.array(message.ranges, dtype=np.float32)
-        where = f"{self.path}: {self._topics[f'scan:{name}']}"
-        if name not in self._scanners:
-            try:
-                self._scanners[name] = LaserScanner(
-                    len(ranges),
-                    float(message.angle_min),
-                    float(message.angle_increment),
-                    float(message.range_max),
-                )
-            except SensorError as error:
-                raise InputError(f"{where}: {error}") from error
-        if len(ranges) != self._scanners[name].n_beams:
-            raise InputError(
-                f"{where}: a scan has {len(ranges)} beams, the first {self._scanners[name].n_beams}"
-            )
-        with np.errstate(invalid="ignore"):
-            known = (ranges >= max(float(message.range_min), 0.0)) & (ranges <= message.range_max)
-        self._scans.setdefault(name, []).append(np.where(known, ranges, np.float32(np.inf)))
+        with naming(f"{self.path}: {self._topics[f'scan:{name}']}"):
+            self._measured.setdefault(name, []).append(scan_of(message))
 
     def _finish(self, poses: FloatArray) -> None:
         """Check that the streams have something in common, and make the rig."""
@@ -322,6 +309,9 @@ class RecordedDrive:
             bad = int(np.flatnonzero(~np.isfinite(poses).all(axis=1))[0])
             raise InputError(f"{self.path}: {self._topics['pose']}: pose {bad + 1} is {poses[bad].tolist()}")
         self.poses = poses
+        for name, scans in self._measured.items():
+            with naming(f"{self.path}: {self._topics[f'scan:{name}']}"):
+                self._scanners[name], self._scans[name] = common_scanner(scans)
         if self.calibration is None:
             if self.head is None or self.head.rig not in RIG_NAMES:
                 raise InputError(f"{self.path}: {HEAD} names no rig of {', '.join(RIG_NAMES)}")
@@ -480,7 +470,11 @@ def _pose_of(message: Any) -> tuple[float, float, float]:
         return float(message.x), float(message.y), float(message.theta)
     pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
     q, at = pose.orientation, pose.position
-    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    norm = math.hypot(q.x, q.y, q.z, q.w)
+    if not _NORMS[0] <= norm <= _NORMS[1]:
+        raise InputError(f"its orientation has the norm {norm:.3g}, want a quaternion of norm 1")
+    # The same in any norm.
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
     return float(at.x), float(at.y), yaw
 
 

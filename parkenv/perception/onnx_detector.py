@@ -6,7 +6,7 @@ import hashlib
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from parkenv.compiled.arrays import Float32Array, Image
-from parkenv.errors import InputError
+from parkenv.errors import InputError, nearest
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
 from parkenv.perception.detector import LEAST_PROBABILITY, Detections
@@ -25,6 +25,7 @@ from parkenv.perception.hog_detector import END, END_BELOW, END_WIDEST, SIDE, as
 MAX_ONNX_BYTES = 256_000_000  # maximum size of an ONNX file
 LONGEST_S, MOST_BYTES = 120, 8 << 30
 """Maximum time and address space of the process that tries an unknown network; Windows knows no such limit."""
+_INPUT_PATTERN = r"<Input> CV_32F\w* \[(\d+ x \d+ x \d+ x \d+)\]"
 _TRIAL = f"""
 try:
     import resource
@@ -37,17 +38,22 @@ import cv2, numpy
 shape = [int(word) for word in sys.argv[1:]]
 cv2.setNumThreads(1)
 net = cv2.dnn.readNetFromONNX(numpy.frombuffer(sys.stdin.buffer.read(), numpy.uint8))
+if not shape[2]:
+    import re
+    fixed = re.search(r"{_INPUT_PATTERN}", net.dump())
+    shape[2:] = [int(word) for word in fixed[1].split(" x ")][2:] if fixed else [640, 640]
+    print(*shape[2:])
 net.setInput(numpy.full(shape, 0.5, numpy.float32))
 net.forward(list(net.getUnconnectedOutLayersNames()))
 """
-_passed: set[tuple[str, tuple[int, ...]]] = set()
+_passed: dict[tuple[str, tuple[int, ...]], tuple[int, int]] = {}
 _COCO = {1: (0,), 80: (2, 5, 7)}  # cars by the number of classes: the only one, or COCO's car, bus and truck
 _BORDER = 114  # grey level around an image in the input
 _CENTER_NUMBERS = 9
 # A tensor whose numbers are in another file has an entry with the key `location`, its field 1, a text of 8 bytes; a
 # protobuf may write either number with more bytes than it needs.
 _ELSEWHERE = re.compile(rb"(?:\x0a|\x8a\x80*\x00)(?:\x08|\x88\x80*\x00)location")
-_INPUT = re.compile(r"<Input> CV_32F\w* \[(\d+ x \d+ x \d+ x \d+)\]")
+_INPUT = re.compile(_INPUT_PATTERN)
 
 Pixels = Annotated[int, Field(ge=16, le=4096)]
 
@@ -55,8 +61,18 @@ Pixels = Annotated[int, Field(ge=16, le=4096)]
 class OnnxSettings(Spec):
     """How a network is fed and read: the file `NAME.toml` beside `NAME.onnx`; all keys are optional."""
 
-    size: Annotated[tuple[Pixels, Pixels], Field(strict=False)] = Field(
-        (640, 640), description="Width and height of the input, px."
+    layout: Literal["yolo", "centers"] | None = Field(
+        None, description="How the output is read. By default as its shape says."
+    )
+    outputs: Several[str] | None = Field(
+        None,
+        min_length=1,
+        max_length=100,
+        description="Names of outputs: the first that fits the layout is read. By default the only one that fits.",
+    )
+    size: Annotated[tuple[Pixels, Pixels], Field(strict=False)] | None = Field(
+        None,
+        description="Width and height of the input, px. By default the file's, or 640×640 if it leaves them open.",
     )
     channels: Literal["rgb", "bgr", "grey"] = Field("rgb", description="Channels of the input.")
     mean: float = Field(0.0, ge=-1_000.0, le=1_000.0, description="Subtracted from each channel, 0 to 255.")
@@ -106,8 +122,8 @@ class Candidates(NamedTuple):
 class OnnxDetector:
     """A `Detector` that runs a network, single-threaded, by OpenCV's `dnn`.
 
-    The image is put into the input as large as fits, centred on grey borders. The network has one output, of either
-    layout:
+    The image is put into the input as large as fits, centred on grey borders. One output of the network has either
+    layout (in the layout yolo, rows of mask coefficients of a second output are no classes):
 
     - *yolo*, (1, 4 + classes, n): centre, width and height of a box in px of the input, and a score of each class, 0 to
       1, as exports of YOLOv8 and later have it;
@@ -132,11 +148,15 @@ class OnnxDetector:
         self._net: Any = None
         if _ELSEWHERE.search(data):
             raise InputError(f"{name}: keeps its weights in other files; export it as a single file")
-        width, height = self.settings.size
-        empty = np.full((1, 1 if self.settings.channels == "grey" else 3, height, width), 0.5, np.float32)
+        width, height = self.settings.size or (0, 0)
+        channels = 1 if self.settings.channels == "grey" else 3
         if not is_known:
-            require_runs(data, name, empty.shape)
-        shape = self._run(empty).shape
+            height, width = require_runs(data, name, (1, channels, height, width))
+        self._size = width or 640, height or 640
+        empty = np.full((1, channels, *self._size[::-1]), 0.5, np.float32)
+        self._output, shape, masks = self._choose(
+            {key: one.shape for key, one in self._run_all(empty).items()}
+        )
         # OpenCV runs a network with an input of another shape, and tells of its own in a description alone.
         net: Any = self._net
         fixed = _INPUT.search(net.dump())
@@ -145,9 +165,9 @@ class OnnxDetector:
                 f"{name}: its input is {fixed[1]}, and size and channels in {sidecar_of(name)} (or their defaults) are "
                 f"for {' x '.join(map(str, empty.shape))}"
             )
-        self._is_centers = len(shape) == 4 and shape[:2] == (1, _CENTER_NUMBERS)
+        self._is_centers = self._fits("centers", shape)
         if not self._is_centers:
-            self._cars = self._classes_of_cars(shape)
+            self._cars = self._classes_of_cars(shape, masks)
 
     @classmethod
     def load(
@@ -163,14 +183,14 @@ class OnnxDetector:
         return self.__dict__ | {"_net": None}  # read again where it is needed
 
     def detect(self, image: Image) -> Detections:
-        fed, scale, offset = _fed(image, self.settings)
+        fed, scale, offset = _fed(image, self.settings, self._size)
         output = self._run(fed)
         if self._is_centers:
             if self.settings.mirror and min(offset) > 0.0:
                 # What the network puts out for the mirrored input, left and right exchanged.
                 mirrored = self._run(np.ascontiguousarray(fed[..., ::-1]))
                 output = 0.5 * (output + mirrored[:, [0, 3, 2, 1, *range(4, _CENTER_NUMBERS)], :, ::-1])
-            decoded = decode_centers(output, self.settings.size, self.settings.threshold)
+            decoded = decode_centers(output, self._size, self.settings.threshold)
         else:
             decoded = decode_yolo(output, self._cars)
         if not (np.isfinite(decoded.boxes).all() and np.isfinite(decoded.score).all()):
@@ -199,6 +219,9 @@ class OnnxDetector:
         )  # fmt: skip
 
     def _run(self, fed: Float32Array) -> Float32Array:
+        return self._run_all(fed)[self._output]
+
+    def _run_all(self, fed: Float32Array) -> dict[str, Float32Array]:
         threads, level = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
         cv2.setNumThreads(1)
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -207,6 +230,7 @@ class OnnxDetector:
                 self._net = cv2.dnn.readNetFromONNX(np.frombuffer(self._data, np.uint8))
             names = list(self._net.getUnconnectedOutLayersNames())
             self._net.setInput(fed)
+            # OpenCV 5 computes all outputs or none.
             outputs = [np.array(output, dtype=np.float32) for output in self._net.forward(names)]
         except cv2.error as error:
             reason = " ".join(str(error).split())
@@ -216,18 +240,44 @@ class OnnxDetector:
         finally:
             cv2.setNumThreads(threads)
             cv2.utils.logging.setLogLevel(level)
-        if len(outputs) != 1:
-            raise InputError(f"{self._name}: has the outputs {', '.join(names)}, want one")
-        return outputs[0]
+        return dict(zip(names, outputs, strict=True))
 
-    def _classes_of_cars(self, shape: Sequence[int]) -> tuple[int, ...]:
+    def _fits(self, layout: str, shape: Sequence[int]) -> bool:
+        if self.settings.layout not in (None, layout):
+            return False
+        if layout == "centers":
+            return len(shape) == 4 and tuple(shape[:2]) == (1, _CENTER_NUMBERS)
         # There are more candidates than numbers of one; others have a candidate in each row.
-        if len(shape) != 3 or shape[0] != 1 or not 4 < shape[1] <= shape[2]:
+        likely = self.settings.layout is not None or shape[1] <= shape[2] if len(shape) == 3 else False
+        return likely and shape[0] == 1 and shape[1] > 4
+
+    def _choose(self, shapes: Mapping[str, Sequence[int]]) -> tuple[str, Sequence[int], int]:
+        """Return the name and shape of the output to read, and the number of mask coefficients in it."""
+        there = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
+        for name in self.settings.outputs or ():
+            if name not in shapes:
+                raise InputError(
+                    f"{sidecar_of(self._name)}: outputs has {name!r:.80}; {nearest(name, shapes)}"
+                )
+        named = list(dict.fromkeys(self.settings.outputs or shapes))
+        fitting = [name for name in named if any(self._fits(k, shapes[name]) for k in ("yolo", "centers"))]
+        if not fitting:
+            wanted = {"yolo": "(1, 4 + classes, n)", "centers": "(1, 9, rows, columns)"}
+            layouts = [wanted[self.settings.layout]] if self.settings.layout else wanted.values()
             raise InputError(
-                f"{self._name}: puts out {tuple(shape)}, want (1, 4 + classes, n) or (1, 9, rows, columns); wrap it in "
-                "a class of your own"
+                f"{self._name}: puts out {there}, want {' or '.join(layouts)}; wrap it in a class of your own"
             )
-        classes, beside = shape[1] - 4, sidecar_of(self._name)
+        if len(fitting) > 1 and not self.settings.outputs:
+            raise InputError(
+                f"{self._name}: puts out {there}; write outputs = [{fitting[0]!r}], or another one, in "
+                f"{sidecar_of(self._name)}"
+            )
+        name = fitting[0]
+        masks = [int(shape[1]) for other, shape in shapes.items() if other != name and len(shape) == 4]
+        return name, shapes[name], masks[0] if len(masks) == 1 and shapes[name][1] > 4 + masks[0] else 0
+
+    def _classes_of_cars(self, shape: Sequence[int], masks: int) -> tuple[int, ...]:
+        classes, beside = shape[1] - 4 - masks, sidecar_of(self._name)
         cars = self.settings.cars or _COCO.get(classes)
         if cars is None:
             raise InputError(
@@ -240,11 +290,14 @@ class OnnxDetector:
         return cars
 
 
-def require_runs(data: bytes, name: str, shape: tuple[int, ...]) -> None:
-    """Check in another process, once for each network, that OpenCV runs it: it does not survive every damaged file."""
+def require_runs(data: bytes, name: str, shape: tuple[int, ...]) -> tuple[int, int]:
+    """Check in another process, once for each network, that OpenCV runs it: it does not survive every damaged file.
+
+    Returns the rows and columns of its input: those of `shape`, or where they are 0 the file's.
+    """
     key = hashlib.sha256(data).hexdigest(), shape
     if key in _passed:
-        return
+        return _passed[key]
     # -I: the process finds installed packages, and nothing in the working folder.
     command = [sys.executable, "-I", "-c", _TRIAL, *map(str, shape)]
     try:
@@ -258,7 +311,9 @@ def require_runs(data: bytes, name: str, shape: tuple[int, ...]) -> None:
         raise InputError(
             f"{name}: OpenCV cannot run this network with an input of shape {shape}: {reason:.300}"
         )
-    _passed.add(key)
+    rows, columns = map(int, done.stdout.split()[-2:]) if not shape[2] else shape[2:]
+    _passed[key] = rows, columns
+    return _passed[key]
 
 
 def sidecar_of(path: str | Path) -> Path:
@@ -299,7 +354,7 @@ def _highest(score: Float32Array, neighbours: NDArray[np.uint8]) -> Float32Array
 
 
 def _fed(
-    image: Image, settings: OnnxSettings
+    image: Image, settings: OnnxSettings, size: tuple[int, int]
 ) -> tuple[Float32Array, tuple[float, float], tuple[float, float]]:
     grey = as_grey(image)  # checks the image
     if settings.channels == "grey":
@@ -308,7 +363,7 @@ def _fed(
         image = np.repeat(grey[..., None], 3, axis=2)
     elif settings.channels == "bgr":
         image = image[..., ::-1]
-    (width, height), (rows, columns) = settings.size, grey.shape
+    (width, height), (rows, columns) = size, grey.shape
     ratio = min(width / columns, height / rows, settings.enlarge)
     fit = max(1, round(columns * ratio)), max(1, round(rows * ratio))
     left, top = (width - fit[0]) // 2, (height - fit[1]) // 2

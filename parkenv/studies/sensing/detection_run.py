@@ -38,6 +38,7 @@ class FoundCars(NamedTuple):
     images: int  # their number
     videos: list[Row]  # of each video: file, frames, seconds, fps, boxes, most_cars
     boxes: list[Row]  # rows of `boxes.csv`
+    not_searched: list[Row]  # topics of recordings with pictures that are not read: file, reason
 
 
 def find_cars(
@@ -52,7 +53,7 @@ def find_cars(
 
     Of a video every `step`-th frame is looked at. Pictures, films and boxes.csv go into a folder, if there is one.
     """
-    chosen = require_readable(paths)  # a damaged one is refused before any work
+    chosen, not_searched = require_readable(paths)  # a damaged one is refused before any work
     files = [source if isinstance(source, Path) else source.file for source in chosen]
     suffixes = [".png" if isinstance(source, Path) else ".mp4" for source in chosen]
     drawings = [
@@ -82,13 +83,13 @@ def find_cars(
             boxes += in_video
     if folder is not None:
         write_csv(folder / "boxes.csv", BOX_COLUMNS, boxes)
-    return FoundCars(len(chosen) - len(videos), videos, boxes)
+    return FoundCars(len(chosen) - len(videos), videos, boxes, not_searched)
 
 
-def require_readable(paths: Sequence[Path]) -> list[Path | Film]:
+def require_readable(paths: Sequence[Path]) -> tuple[list[Path | Film], list[Row]]:
     """Return the images, as their paths, and the videos that are named or in the named folders, in order.
 
-    Each camera of a recording is a video.
+    Each camera of a recording is a video; topics with pictures that are not read are returned, too.
     """
     files: list[Path] = []
     for path in paths:
@@ -97,15 +98,20 @@ def require_readable(paths: Sequence[Path]) -> list[Path | Film]:
         else:
             files.append(path)
     found: list[Path | Film] = []
+    not_searched: list[Row] = []
     for file in dict.fromkeys(files):
         if is_recording(file):
-            found += footage_in(file)
+            cameras, others = footage_in(file)
+            found += cameras
+            not_searched += [
+                {"file": f"{file}:{topic}", "reason": reason} for topic, reason in others.items()
+            ]
         elif file.suffix.lower() in VIDEO_SUFFIXES:
             found.append(Video.of(file))
         else:
             read_image(file)
             found.append(file)
-    return found
+    return found, not_searched
 
 
 def detect_in_image(file: Path, detector: Detector, threshold: float, drawn: Path | None) -> list[Row]:
