@@ -32,13 +32,6 @@ The US Department of Transportation values local personal travel at half of the 
 """
 DAYS = ("Mo", "Tu", "We", "Th", "Fr", "Sa", "Su")
 _RULE = re.compile(r"(?:(?P<days>[A-Z][a-z](?:[-,][A-Z][a-z])*) +)?(?P<times>off|\d?\d:\d\d-\d.*)")
-_CHARGE = re.compile(
-    r"(\d+(?:[.,]\d+)?)[^\d/]{0,8}?(?:/|per)\s*(\d+(?:\.\d+)?)?\s*(h|hr|hours?|min|minutes?|days?|Stunde|Tag)\b",
-    re.I,
-)
-_HOURS_OF = {"h": 1.0, "s": 1.0, "m": 1.0 / 60.0, "d": 24.0, "t": 24.0}
-"""Hours of a unit, by its first letter."""
-MOST_PER_HOUR = 1000.0  # a higher charge is a mistake
 _SPAN = re.compile(r"(\d?\d):(\d\d)-(\d?\d):(\d\d)")
 
 
@@ -346,17 +339,6 @@ def parse_change(given: float | str) -> tuple[Price, bool]:
     """Return the price of a tariff, and whether it is added to that of a zone, as a text such as `+1/h` says."""
     is_added = isinstance(given, str) and given.startswith("+") and "@" not in given
     return Price.parse(str(given)[1:] if is_added else given), is_added
-
-
-def charge_in(text: str) -> tuple[float, bool] | None:
-    """Return the price of an hour that OpenStreetMap's `charge` has, and whether it is paid by the day; else None."""
-    match = _CHARGE.search(text)
-    if match is None:
-        return None
-    unit = match[3][0].lower()
-    hours = float(match[2] or 1.0) * _HOURS_OF[unit]
-    per_hour = float(match[1].replace(",", ".")) / hours if hours else 0.0
-    return (per_hour if per_hour <= MOST_PER_HOUR else 0.0), unit in "dt"
 
 
 def _per_hour(text: str, field: str, whole: str) -> float:

@@ -37,6 +37,7 @@ from parkenv.lots.infer.layout import draft_inferred_lot, infer_lot
 from parkenv.lots.infer.network import STREET, Line, limit_junctions
 from parkenv.lots.infer.spaces import rectangle_corners, spaces_from_outlines, to_rectangle, validate_areas
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm.conditions import RESERVED_PLACES
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.parking import (
     ARRANGEMENTS,
@@ -68,6 +69,7 @@ from parkenv.lots.osm.roads import (
     clipped_road,
     closed_to_cars,
     components_with_slots,
+    count_in,
     lanes_of,
     off_the_ground,
     open_ends,
@@ -251,9 +253,10 @@ class _LotImport(MapImport):
             if shapely.contains(area.polygon, centers).any():
                 continue
             orientation = tags.get("orientation", tags.get("parking:orientation"))
-            capacity = whole_number(tags.get("capacity"))
+            capacity = count_in(tags, "capacity", "as many as fit")
             if capacity is not None:
-                capacity = max(capacity - (whole_number(tags.get("capacity:disabled")) or 0), 0)
+                parts = (whole_number(tags.get(f"capacity:{users}")) or 0 for users in RESERVED_PLACES)
+                capacity = max(capacity - sum(parts), 0)
             near = np.sort(tree.query(area.polygon, predicate="dwithin", distance=SLOT_REACH)).tolist()
             on_it = np.flatnonzero(shapely.dwithin(np.array(self.blocked, dtype=object), area.polygon, 1.0))
             slots, rank = NO_SLOTS, Rank.SERVICE

@@ -1,8 +1,8 @@
 """The parking of a map: drawn spaces, areas filled by rule and kerbs; and buildings as goals and walls.
 
 Both tagging schemes of kerbs are read: `parking:left|right|both` with `:orientation`, `:capacity`, `:restriction` and
-`:access`, and the deprecated `parking:lane:left|right|both` with `parking:condition:...`. Restrictions at
-certain hours (`:conditional`) are ignored. A capacity of `both` applies to each side.
+`:access`, and the deprecated `parking:lane:left|right|both` with `parking:condition:...`; a lot has kerbs where
+everybody may park at some hours. A capacity of `both` applies to each side.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.generators import (
     BAY_SIZE,
@@ -24,6 +24,18 @@ from parkenv.lots.generators import (
     slots_from_polygons,
 )
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm.conditions import (
+    FORBIDDEN,
+    RESERVED,
+    Conditional,
+    access_layer,
+    always,
+    conditional,
+    note_users,
+    parking_users,
+    users_of,
+    week_of,
+)
 from parkenv.lots.osm.elements import OsmElement
 from parkenv.lots.osm.roads import (
     SIDES,
@@ -31,12 +43,15 @@ from parkenv.lots.osm.roads import (
     Road,
     Side,
     closed_to_cars,
+    count_in,
     metres,
     off_the_ground,
     whole_number,
 )
+from parkenv.lots.unread import note_unread
 from parkenv.world.drive_graph import SLOT_REACH, node_labels
 from parkenv.world.lot import Lane, Mouth
+from parkenv.world.tariff import PUBLIC
 
 
 @dataclass(frozen=True)
@@ -128,10 +143,6 @@ def without_overlaps(boxes: NDArray[np.object_]) -> NDArray[np.bool_]:
 
 
 PARKED = ("lane", "street_side", "on_kerb", "half_on_kerb", "shoulder", "yes")
-FORBIDDEN = (
-    *("no_parking", "no_stopping", "no_standing", "no_waiting", "fire_lane"),
-    *("loading", "loading_only", "charging_only", "disabled", "private"),
-)
 OLD_ORIENTATIONS = {
     **{name: name for name in ARRANGEMENTS},
     **{"inline": "parallel", "orthogonal": "perpendicular", "marked": "parallel", "yes": "parallel"},
@@ -153,36 +164,85 @@ class Kerb:
     on_carriageway: bool  # whether parked cars are within `width`
 
 
-def kerb_of(tags: Mapping[str, str], side: Side) -> Kerb | str | None:
-    """Return the parking on one side of a way; a reason if tagged but unusable; None without tags."""
+def kerb_tag(tags: Mapping[str, str], key: str, side: Side) -> str:
+    """Return the key of one side of a way, `{}` in the text, that the tags have; else that of both."""
+    return next((k for k in (key.format(side), key.format("both")) if k in tags), key.format("both"))
 
-    def tag(start: str, end: str = "") -> str | None:
-        return tags.get(f"{start}:{side}{end}", tags.get(f"{start}:both{end}"))
 
-    kind = tag("parking")
-    if kind is not None:
-        if kind in ("no", "separate"):
-            return None
-        orientation = tag("parking", ":orientation") or "parallel"
-        if kind not in PARKED or orientation not in ARRANGEMENTS:
-            return f"kerbs with parking={kind}, orientation={orientation}, which is not known"
-        for key, closed in (("restriction", FORBIDDEN), ("access", ("no", "private"))):
-            value = tag("parking", f":{key}")
-            if value in closed:
-                return f"kerbs with {key}={value}"
-        return Kerb(orientation, whole_number(tag("parking", ":capacity")), kind == "lane")
+def kerb_conditions(tags: Mapping[str, str], side: Side) -> Conditional:
+    """Return the values of `parking:condition`, those of other hours, and a `parking:lane` that forbids parking."""
+    key, lane = (kerb_tag(tags, f"parking:{what}:{{}}", side) for what in ("condition", "lane"))
+    forbidden = tags.get(lane, "") if users_of(tags.get(lane, "")) == FORBIDDEN else ""
+    both_is_own = "parking:condition:both" in tags and key in tags
+    parts = []
+    for own in ("{}", "{}:2", "2:{}", "{}:3", "3:{}"):
+        at = kerb_tag(tags, f"parking:condition:{own}", side)
+        interval_key, vehicles_key = (
+            f"{at}:{what}" if both_is_own else kerb_tag(tags, f"parking:condition:{own}:{what}", side)
+            for what in ("time_interval", "vehicles")
+        )
+        value, interval = tags.get(at) or "", tags.get(interval_key, "")
+        if own == "{}" and interval and not value:
+            value, forbidden = forbidden or "free", ""
+        # What is for some vehicles alone is for no ordinary car; what binds these alone does not concern it.
+        vehicles = tags.get(vehicles_key, "")
+        if vehicles and users_of(vehicles) != PUBLIC:
+            value = "" if users_of(value) == FORBIDDEN else RESERVED.get(vehicles, "no")
+        week = week_of(interval) if interval and value else None
+        if interval and value and (week is None or week.doubt):
+            note_unread(tags, interval_key, "at all times" if week is None else week.doubt)
+        if value:
+            note_users(tags, at, (value, ()))
+            parts.append((value, always() if week is None else week.minutes))
+    default = f"{key}:default" if both_is_own else kerb_tag(tags, "parking:condition:{}:default", side)
+    return forbidden or tags.get(default, ""), [*parts, *conditional(tags, key)[0][1]]
 
-    old = tag("parking:lane")
-    if old is None or old in ("no", "none", "separate", "drawn_separately"):
+
+def kerb_users(tags: Mapping[str, str], side: Side) -> tuple[str, BoolArray]:
+    """Return the class of users of one side of a way, and when they may park there."""
+    restriction = kerb_tag(tags, "parking:{}:restriction", side)
+    conditional_restriction = kerb_tag(tags, "parking:{}:restriction:conditional", side)
+    if conditional_restriction.rpartition(":")[0] != restriction and restriction not in tags:
+        restriction = conditional_restriction.rpartition(":")[0]
+    layers = [note_users(tags, restriction, conditional(tags, restriction)[0]), kerb_conditions(tags, side)]
+    layers += [access_layer(tags, f"parking:{at}:") for at in (side, "both")]
+    return parking_users(layers, always())
+
+
+def kerb_of(tags: Mapping[str, str], side: Side, *, reserved: bool = False) -> Kerb | str | None:
+    """Return the parking on one side of a way; a reason if tagged but unusable; None without tags.
+
+    With `reserved`, kerbs for a class of users are usable, too.
+    """
+    key, lane = kerb_tag(tags, "parking:{}", side), kerb_tag(tags, "parking:lane:{}", side)
+    kind, old = tags.get(key), tags.get(lane)
+    if kind in ("no", "separate") or (
+        kind is None and (old is None or old in ("no", "none", "separate", "drawn_separately"))
+    ):
         return None
-    condition = tag("parking:condition")
-    if old in FORBIDDEN or condition in FORBIDDEN:
-        return f"kerbs with {old if old in FORBIDDEN else condition}"
-    if old not in OLD_ORIENTATIONS:
-        return f"kerbs with parking:lane={old}, which is not known"
-    where = tag("parking:lane", f":{old}") or "on_street"
-    capacity = whole_number(tag("parking:lane", ":capacity") or tag("parking", ":capacity"))
-    return Kerb(OLD_ORIENTATIONS[old], capacity, where == "on_street")
+    orientation = tags.get(kerb_tag(tags, "parking:{}:orientation", side)) or "parallel"
+    if kind is None:
+        orientation = OLD_ORIENTATIONS.get(old or "", "parallel" if users_of(old or "") == FORBIDDEN else "")
+    if orientation not in ARRANGEMENTS or (kind is not None and kind not in PARKED):
+        note_unread(tags, lane if kind is None else key, "no parking")
+        named = f"parking:lane={old}" if kind is None else f"parking={kind}, orientation={orientation}"
+        return f"kerbs with {named}, which is not known"
+    users, minutes = kerb_users(tags, side)
+    if users == FORBIDDEN or not minutes.any():
+        return "kerbs where parking is forbidden"
+    if users != PUBLIC and not reserved:
+        return f"kerbs for {users}"
+    keys = (
+        ("parking:{}:capacity",) if kind is not None else ("parking:lane:{}:capacity", "parking:{}:capacity")
+    )
+    counts = (count_in(tags, kerb_tag(tags, text, side), "by the length of the kerb") for text in keys)
+    capacity = next((count for count in counts if count is not None), None)
+    where = (
+        kind
+        if kind is not None
+        else tags.get(kerb_tag(tags, f"parking:lane:{{}}:{old}", side)) or "on_street"
+    )
+    return Kerb(orientation, capacity, where in ("lane", "on_street"))
 
 
 def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float, float]]) -> Slots:

@@ -18,6 +18,7 @@ from parkenv.lots.draft import LeftOut
 from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import OsmElement, OsmMap
+from parkenv.lots.unread import note_unread
 from parkenv.world.drive_graph import (
     NODE_TOLERANCE,
     Chains,
@@ -247,11 +248,35 @@ def _is_ticket_gate(tags: Mapping[str, str]) -> bool:
     return tags.get("barrier") == TICKET_GATE and not closed_to_cars(tags) and tags.get("locked") != "yes"
 
 
-def closed_to_cars(tags: Mapping[str, str]) -> str | None:
+ACCESS = ("motorcar", "motor_vehicle", "vehicle", "access")
+"""Keys of access, the most specific first."""
+NOT_CARS = (
+    *("no", "agricultural", "forestry", "military", "emergency", "hgv", "goods", "bus", "psv", "taxi", "coach"),
+    *("tourist_bus", "motorcycle", "moped", "bicycle", "foot", "caravan", "motorhome", "horse", "trailer"),
+)  # fmt: skip
+"""Values of access, and keys whose value `only` says the same, that let no ordinary car in."""
+
+
+def decisive_access(tags: Mapping[str, str], prefix: str = "") -> str | None:
+    """Return the most specific key of access that the tags have after a prefix, or None."""
+    return next((key for key in ACCESS if prefix + key in tags), None)
+
+
+def closed_to_cars(tags: Mapping[str, str], *, private: bool = True) -> str | None:
     """Return the tag that excludes cars (the most specific access tag decides), or None."""
-    for key in ("motorcar", "motor_vehicle", "vehicle", "access"):
-        if key in tags:
-            return f"{key}={tags[key]}" if tags[key] in ("no", "private") else None
+    for key in NOT_CARS:
+        if tags.get(key) == "only":
+            return f"{key}=only"
+    key = decisive_access(tags)
+    if key is not None:
+        closed = {*NOT_CARS, "delivery", "official", "private"} if private else {*NOT_CARS}
+        values = re.split(r"\s*[;,]\s*", tags[key].strip().lower())
+        return f"{key}={tags[key]}" if closed.issuperset(values) else None
+    if tags.get("highway") == "service":
+        return next(
+            (f"{key}=designated" for key in ("emergency", "bus", "psv") if tags.get(key) == "designated"),
+            None,
+        )
     return None
 
 
@@ -273,11 +298,25 @@ def metres(text: str | None) -> float | None:
     return value if 0.0 < value < 100.0 else None
 
 
+_COUNT = re.compile(
+    r"(?:[^\W\d]{1,15}\.?|[~>≥<≤±=+]|\s){0,4}([0-9]{1,5})(?:\.0+)?(?:\s*(?:-|–|to|bis)\s*([0-9]{1,5}))?"
+    r"(?:[^\W\d]|[\s+.~]){0,20}(?:\(.*\))?"
+)
+
+
 def whole_number(text: str | None) -> int | None:
-    """Parse a count, also of texts such as `> 110`, `50+`, `ca. 60` and `1,500`; the middle of `20-30`; else None."""
-    plain = re.sub(r"(?<=\d)[,. ](?=\d{3}(?!\d))", "", (text or "").strip())
-    match = re.fullmatch(r"[^\d-]{0,5}(\d{1,5})(?:\s*[-–]\s*(\d{1,5}))?\D{0,10}", plain)
+    """Parse a count, also of texts such as `approx 110`, `50+`, `60 (5 women)`, `1,500`; the middle of `20-30`."""
+    plain = re.sub(r"(?<=\d)[,. '](?=\d{3}(?!\d))", "", (text or "").strip())
+    match = _COUNT.fullmatch(plain)
     return (int(match[1]) + int(match[2] or match[1])) // 2 if match else None
+
+
+def count_in(tags: Mapping[str, str], key: str, assumed: str) -> int | None:
+    """Return the count that a tag says; a text that is none is listed with what is assumed instead."""
+    count = whole_number(tags.get(key))
+    if count is None:
+        note_unread(tags, key, assumed)
+    return count
 
 
 def lanes_of(roads: Sequence[Road]) -> list[Lane]:

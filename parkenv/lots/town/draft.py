@@ -30,6 +30,7 @@ from parkenv.files.file_names import is_plain
 from parkenv.lots.draft import LeftOut, LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots, nearest_on_lanes
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm.conditions import RESERVED_PLACES, closed_parking
 from parkenv.lots.osm.draft import (
     MAPPED_OVERLAP,
     NO_AISLE,
@@ -48,7 +49,7 @@ from parkenv.lots.osm.parking import (
     is_space,
     without_overlaps,
 )
-from parkenv.lots.osm.roads import Rank, Turns, off_the_ground, turns_of, whole_number
+from parkenv.lots.osm.roads import Rank, Turns, count_in, off_the_ground, turns_of
 from parkenv.lots.town.streets import read_streets
 from parkenv.lots.town.supply import (
     CLASS_RULE,
@@ -69,7 +70,7 @@ from parkenv.lots.town.supply import (
     strip_side,
     table_of,
 )
-from parkenv.lots.unread import unread_table
+from parkenv.lots.unread import note_unread, unread_table
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_REACH
 from parkenv.world.lot import Lane
@@ -79,18 +80,12 @@ ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_ent
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
-RESERVED_PLACES = ("disabled", "charging")
-"""Classes of users whose places a car park may count apart: `capacity:disabled`, `capacity:charging`."""
 PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
 """Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it."""
 NO_ENTRY = "no entry: no street crosses the edge of the map"
 TOO_FAR = f"parking farther than {FACILITY_REACH:g} m from every street"
 NO_GOAL = "no goal: no building and no point of interest in it; export buildings and shops, too"
-CLOSED = {
-    "parking": ("construction", "disused", "abandoned"),
-    "access": ("no", "military", "forestry", "agricultural"),
-}
-"""Values of tags of parking that no car in town may use."""
+UNUSED = ("construction", "disused", "abandoned")  # values of `parking` that no car may use
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,11 +168,11 @@ class _TownImport(MapImport):
         self.listed: list[str] = []  # which facilities car parks of a list are
 
     def _is_open(self, element: OsmElement) -> bool:
-        for key, closed in CLOSED.items():
-            if (value := element.tags.get(key)) in closed:
-                self.left_out[f"parking with {key}={value}"].append(element.id)
-                return False
-        return True
+        kind = element.tags.get("parking")
+        reason = f"parking={kind}" if kind in UNUSED else closed_parking(element.tags)
+        if reason is not None:
+            self.left_out[f"parking with {reason}"].append(element.id)
+        return reason is None
 
     def _named(self, tags: Any, element_id: str) -> str:
         name = str(tags.get("name", ""))
@@ -191,9 +186,7 @@ class _TownImport(MapImport):
         spaces = []
         for area in self.areas(is_space, mended=True):
             tags, kind = area.element.tags, area.element.tags.get("parking_space", "normal")
-            reason = off_the_ground(tags)
-            if reason is None and tags.get("access") in CLOSED["access"]:
-                reason = f"access={tags['access']}"
+            reason = off_the_ground(tags) or closed_parking(tags)
             if kind not in CAR_SPACES and rules_of(tags).users == PUBLIC:
                 reason = f"parking_space={kind}"
             if area.element.cut:
@@ -228,7 +221,7 @@ class _TownImport(MapImport):
             row.slots = Slots.joined(drawn)
             # A space without rules of its own has those of its car park.
             row.slot_rules = [own if own != Rules() else whole for own in rules]
-            row.tagged = whole_number(inside.tags.get("capacity")) if k in self.used else None
+            row.tagged = count_in(inside.tags, "capacity", "the drawn places") if k in self.used else None
             more = (row.tagged or 0) - len(row.slots)
             if more > 0:
                 row.xy = self._entrance(self.parking[k].polygon, [])
@@ -277,7 +270,11 @@ class _TownImport(MapImport):
         self.rows += [row for row in rows if len(row.slots)]
 
     def read_counted(self) -> None:
-        ways_in = [e for e in self.nodes if e.tags.get("amenity") == "parking_entrance"]
+        ways_in = [
+            e
+            for e in self.nodes
+            if e.tags.get("amenity") == "parking_entrance" and closed_parking(e.tags) is None
+        ]
         entrances = [self.frame.to_xy(e.lines[0])[0] for e in ways_in]
         points = [
             (e, shapely.Point(self.frame.to_xy(e.lines[0])[0]), None)
@@ -300,16 +297,20 @@ class _TownImport(MapImport):
             if xy is None:
                 self.left_out[TOO_FAR].append(element.id)
                 continue
-            tagged = whole_number(tags.get("capacity"))
+            tagged = count_in(tags, "capacity", "by area and levels")
             source = ("tag", "") if tagged else ("rule", rule)
             row = FacilityRow(self._named(tags, element.id), kind, rules, *source, element.id, tagged, xy=xy)
             rest = tagged or expected_capacity(rule, area, levels_of(tags))
             for users in RESERVED_PLACES:
-                n = whole_number(tags.get(f"capacity:{users}")) or 0
-                if 0 < n < rest:
-                    row.counted.append((f"{row.name}, {users}", n, replace(rules, users=users)))
-                    rest -= n
-            row.counted.insert(0, (row.name, rest, rules))
+                key = f"capacity:{users}"
+                n = 0 if tags.get(key) == "no" else count_in(tags, key, "no reserved place") or 0
+                if n > rest:
+                    note_unread(tags, key, "all places that are left")
+                if min(n, rest) > 0:
+                    row.counted.append((f"{row.name}, {users}", min(n, rest), replace(rules, users=users)))
+                    rest -= min(n, rest)
+            if rest:
+                row.counted.insert(0, (row.name, rest, rules))
             self.rows.append(row)
 
     def use_list(self, listed: list[ListedCarPark]) -> None:

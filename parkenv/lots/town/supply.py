@@ -22,13 +22,28 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, ConfigDict, Field
 from scipy.optimize import linear_sum_assignment
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError, naming
 from parkenv.files.field_types import Name
 from parkenv.files.limited_reading import csv_records
 from parkenv.files.spec_file import Spec
 from parkenv.lots.draft import LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots
+from parkenv.lots.osm.conditions import (
+    RESERVED,
+    Charge,
+    Conditional,
+    access_layer,
+    always,
+    at_hours,
+    charge_in,
+    conditional,
+    duration,
+    hours_text,
+    opening,
+    parking_users,
+    week_of,
+)
 from parkenv.lots.osm.parking import (
     ARRANGEMENTS,
     SHORTEST_KERB_SLOT,
@@ -36,33 +51,21 @@ from parkenv.lots.osm.parking import (
     Junctions,
     Kerb,
     free_intervals,
+    kerb_conditions,
     kerb_of,
     kerb_slots,
+    kerb_tag,
+    kerb_users,
 )
-from parkenv.lots.osm.roads import SIDES, Rank, Road, Side, whole_number
+from parkenv.lots.osm.roads import SIDES, Rank, Road, Side, count_in
+from parkenv.lots.unread import note_unread
 from parkenv.world.drive_graph import linestrings
 from parkenv.world.facility import Facility
-from parkenv.world.tariff import PUBLIC, Hours, Price, Zone, charge_in
-from parkenv.world.week import DAY_S, HOUR_S
+from parkenv.world.tariff import PUBLIC, Hours, Price, Zone
+from parkenv.world.week import DAY_S
 
 PRICE = 2.0  # assumed price of an hour where a fee is charged, in the currency of the town
-RESERVED = {
-    "loading": "delivery",
-    "loading_only": "delivery",
-    "delivery": "delivery",
-    "charging": "charging",
-    "charging_only": "charging",
-    "disabled": "disabled",
-    "private": "private",
-    "employees": "private",
-    "residents": "permit",
-    "permit": "permit",
-    "customers": "customers",
-}
-"""Class of users for each value of `access`, `parking:condition` and `restriction` that not everyone may park by."""
-LONGEST_LIMIT = 24 * HOUR_S  # s; a longer `maxstay` is no limit for a day's parking
-_STAY = re.compile(r"(\d+(?:[.,]\d+)?)\s*(h|hr|hour|hours|m|min|minute|minutes)\b", re.I)
-_HOURS = re.compile(r"[A-Z][a-z](?:[-,][A-Z][a-z])*\s+\d?\d:\d\d-\d?\d:\d\d")
+LONGEST_LIMIT = 7 * DAY_S  # s; from this `maxstay` on, there is no limit
 
 
 @dataclass(frozen=True)
@@ -71,101 +74,180 @@ class Rules:
 
     users: str = PUBLIC
     per_hour: float = 0.0
-    charged: str = ""  # hours, as OpenStreetMap writes them; empty: always
+    charged: str = (
+        ""  # hours, as OpenStreetMap writes them; empty: always. Of a free place, those of `max_stay_s`
+    )
     max_stay_s: float | None = None
     assumed: bool = False  # whether the price is
     by_day: bool = False  # whether a day costs 24 `per_hour`, however short the stay
     hours: str = ""  # when it is open, as OpenStreetMap writes it; empty: always
+    daily_cap: float | None = None  # most that a day costs
+    free_s: float = 0.0  # first s that cost nothing
+    hourly: str = ""  # prices by hours instead of `per_hour` and `charged`, as `Price.parse` reads them
 
     def zone(self, kind: str) -> Zone:
         words = [kind]
         if self.users != PUBLIC:
             words.append(self.users)
-        if self.per_hour:
+        if self.per_hour or self.hourly:
             each = f"{24 * self.per_hour:g}/day" if self.by_day else f"{self.per_hour:g}/h"
-            words.append("paid" if self.assumed else each)
+            words.append(self.hourly or ("paid" if self.assumed else each))
+            words += [f"at most {self.daily_cap:g}/day"] if self.daily_cap else []
+            words += [f"after {self.free_s / 60:g} min"] if self.free_s else []
             words += [self.charged] if self.charged else []
         elif self.users == PUBLIC:
             words.append("free")
         if self.max_stay_s is not None:
             words.append(f"{self.max_stay_s / 60:g} min")
+            words += [self.charged] if self.charged and not self.per_hour else []
         words += [f"open {self.hours}"] if self.hours else []
-        charged = Hours.parse(self.charged) if self.charged and self.per_hour else None
-        price = Price(self.per_hour, ((DAY_S, 24 * self.per_hour),) if self.by_day else (), charged=charged)
+        charged = Hours.parse(self.charged) if self.charged else None
+        steps = ((DAY_S, 24 * self.per_hour),) if self.by_day else ()
+        price = Price(self.per_hour, steps, self.free_s, self.daily_cap, charged)
+        if self.hourly:
+            price = replace(Price.parse(self.hourly), daily_cap=self.daily_cap)
         hours = Hours.parse(self.hours) if self.hours else None
         return Zone(" ".join(words), price, hours, self.max_stay_s, (self.users,))
 
 
 def rules_of(tags: Mapping[str, str]) -> Rules:
-    users = RESERVED.get(tags.get("parking_space", ""), RESERVED.get(tags.get("access", ""), PUBLIC))
-    rules = _rules(
-        users, tags.get("fee"), tags.get("charge"), tags.get("fee:conditional"), tags.get("maxstay")
-    )
-    # But for holidays.
-    hours = _shortest(re.sub(r"[;,]?\s*(PH|SH)\b[^;]*", "", tags.get("opening_hours", "")).strip("; "))
-    return rules if hours in (_shortest("24/7"), _shortest("off")) else replace(rules, hours=hours)
+    users, hours = parking_users([access_layer(tags)], opening(tags))
+    users = RESERVED.get(tags.get("parking_space", ""), users) or "private"
+    fee, _ = conditional(tags, "fee")
+    return _rules(users, hours, tags, "fee", fee, "charge", "maxstay", always())
 
 
 def kerb_rules(tags: Mapping[str, str], side: Side) -> Rules:
-    def tag(key: str) -> str | None:
-        return tags.get(key.format(side), tags.get(key.format("both")))
-
-    condition = tag("parking:condition:{}") or ""
-    user = next(
-        (
-            RESERVED[value]
-            for value in (
-                tag("parking:{}:restriction"),
-                tag("parking:{}:access"),
-                *re.split(r"[;,]", condition),
-                tag("parking:lane:{}"),
-            )
-            if value in RESERVED
-        ),
-        PUBLIC,
-    )
-    # Where a ticket or a permit is wanted, everyone may park.
-    if user == "permit" and re.search(r"ticket|free|disc", condition):
-        user = PUBLIC
-    fee = tag("parking:{}:fee")
-    if fee is None and ("ticket" in condition or (not condition and "parking:ticket:zone" in tags)):
-        fee = "yes"
-    interval = tag("parking:condition:{}:time_interval") if fee == "yes" else None
-    return _rules(
-        user,
-        fee,
-        tag("parking:{}:charge"),
-        tag("parking:{}:fee:conditional") or (f"yes @ ({interval})" if interval else None),
-        tag("parking:{}:maxstay") or tag("parking:condition:{}:maxstay"),
-    )
+    users, hours = kerb_users(tags, side)
+    users = users or "private"
+    keys = [kerb_tag(tags, f"parking:{{}}:{what}", side) for what in ("fee", "charge", "maxstay")]
+    conditions, limited = kerb_conditions(tags, side), always()
+    stay = kerb_tag(tags, "parking:condition:{}:maxstay", side)
+    if keys[2] not in tags:
+        keys[2], limited = stay, conditions[1][0][1] if conditions[1] else always()
+    conditional_fee = kerb_tag(tags, "parking:{}:fee:conditional", side)
+    if keys[0] not in tags and conditional_fee in tags:
+        keys[0] = conditional_fee.removesuffix(":conditional")
+    fee, _ = conditional(tags, keys[0])
+    if keys[0] not in tags and not fee[1]:
+        has_ticket = any(
+            "ticket" in value for value in (conditions[0], *(value for value, _ in conditions[1]))
+        )
+        own = kerb_tag(tags, "parking:condition:{}", side)
+        in_zone = "parking:ticket:zone" in tags and own not in tags
+        ticket = (
+            limited if in_zone and not has_ticket else at_hours(conditions, lambda value: "ticket" in value)
+        )
+        fee = ("no", [("yes", ticket)])
+    return _rules(users, hours, tags, keys[0], fee, keys[1], keys[2], limited)
 
 
 def _rules(
-    users: str, fee: str | None, charge: str | None, conditional: str | None, maxstay: str | None
-) -> Rules:
-    per_hour, assumed, by_day = 0.0, False, False
-    if charge is not None and (known := charge_in(charge)) is not None:
-        per_hour, by_day = known
-    elif (fee or "no").lower() not in ("no", "free", "unknown") or (conditional or "").startswith("yes"):
-        per_hour, assumed = PRICE, True
-    texts = (fee, conditional, charge) if per_hour else ()
-    readable = (_shortest("; ".join(_HOURS.findall(text or ""))) for text in texts)
-    charged = next(filter(None, readable), "").removesuffix("; Sa,Su off").removesuffix("; Su off")
-    stay = None
-    if maxstay is not None and (match := _STAY.search(maxstay)):
-        seconds = float(match[1].replace(",", ".")) * (HOUR_S if match[2].lower().startswith("h") else 60.0)
-        stay = seconds if 0.0 < seconds < LONGEST_LIMIT else None
+    users: str, open_at: BoolArray, tags: Mapping[str, str], fee_key: str, fee: Conditional,
+    charge_key: str, stay_key: str, limited: BoolArray,
+) -> Rules:  # fmt: skip
+    charge, clauses = Charge(PRICE), list[tuple[Charge, BoolArray]]()
+    paid = _paid_at(tags, fee_key, fee)
+    (text, at_times), _ = conditional(tags, charge_key)
+    read = [(charge_in(text) if text else None, always())]
+    read += [(charge_in(value), when) for value, when in at_times]
+    if any(known is None for known, _ in read[not text :]):
+        note_unread(
+            tags,
+            charge_key if text and read[0][0] is None else f"{charge_key}:conditional",
+            f"{PRICE:g} an hour",
+        )
+    for known, when in read:
+        if known is not None:
+            clauses.append((known, when))
+            if known.doubt:
+                note_unread(tags, charge_key, known.doubt)
+    if clauses:
+        named = fee_key in tags or fee[1]
+        covered = np.any([when for _, when in clauses], axis=0)
+        paid = paid if named and (paid.any() or fee[0] == "no") else covered
+        charge = clauses[-1][0]
+    (_, _), short = conditional(tags, fee_key)
+    free_s = max((below for value, below in short if value in FREE and below > 0.0), default=0.0)
+    if any(value not in FREE or below < 0.0 for value, below in short):
+        note_unread(tags, f"{fee_key}:conditional", "without the condition on stays")
+    by_hour: dict[float, BoolArray] = {}
+    for known, when in clauses:
+        by_hour = {price: minutes & ~when for price, minutes in by_hour.items()}
+        by_hour[known.per_hour] = by_hour.get(known.per_hour, ~always()) | (when & paid)
+    by_hour = {price: minutes for price, minutes in by_hour.items() if price and minutes.any()}
+    hourly = ""
+    if len(by_hour) > 1:
+        hourly = "; ".join(
+            f"{price:g} @ {rule}"
+            for price, minutes in by_hour.items()
+            for rule in hours_text(minutes).split("; ")
+            if not rule.endswith(" off")
+        )
+    elif clauses:
+        paid = next(iter(by_hour.values()), ~always())
+        charge = next((known for known, _ in clauses if known.per_hour in by_hour), charge)
+    is_paid = bool(paid.any() and charge.per_hour)
+    stay, limited = _longest_stay(tags, stay_key, limited)
+    counted = paid if is_paid else limited
+    if stay is not None and is_paid and (limited != paid).any() and not limited.all():
+        note_unread(tags, stay_key, "a limit of stays in the charged hours")
+    charged = _without_off(hours_text(counted)) if is_paid or stay is not None else ""
     return Rules(
-        users, round(per_hour, 4 if by_day else 2), charged, stay, assumed, by_day and per_hour > 0.0
+        users,
+        round(charge.per_hour, 4 if charge.by_day else 2) if is_paid and not hourly else 0.0,
+        "" if hourly else charged,
+        stay,
+        is_paid and not clauses,
+        is_paid and charge.by_day and not hourly,
+        hours_text(open_at),
+        charge.daily_cap if is_paid else None,
+        free_s if is_paid and not hourly else 0.0,
+        hourly,
     )
 
 
-def _shortest(text: str) -> str:
-    """Return hours in their shortest form; empty if there are none that can be read."""
-    try:
-        return str(Hours.parse(text)) if text else ""
-    except InputError:
-        return ""
+FREE = ("no", "free", "none", "0", "")
+"""Values of `fee` where nothing is charged."""
+
+
+def _paid_at(tags: Mapping[str, str], key: str, fee: Conditional) -> BoolArray:
+    """Return when a fee is charged; without a tag, always where the conditions only say when not."""
+    base, clauses = fee[0].lower(), fee[1]
+    if not base and clauses and all(value in FREE for value, _ in clauses):
+        base = "yes"
+    if base == "unknown":
+        note_unread(tags, key, "free")
+        base = "no"
+    week = None if base in (*FREE, "yes", "ticket", "paid", "interval") else week_of(base)
+    if week is not None:
+        if week.doubt:
+            note_unread(tags, key, week.doubt)
+        return at_hours(("no", [("yes", week.minutes), *clauses]), lambda value: value not in FREE)
+    if base not in (*FREE, "yes", "ticket", "paid") and charge_in(base) is None:
+        note_unread(tags, key, "charged at all times")
+    return at_hours((base, clauses), lambda value: value not in FREE)
+
+
+def _longest_stay(tags: Mapping[str, str], key: str, limited: BoolArray) -> tuple[float | None, BoolArray]:
+    """Return the limit of a stay, s, and when it counts; of several limits the shortest one."""
+    (text, clauses), _ = conditional(tags, key)
+    limits = []
+    for value, when in (*([(text, limited)] if text else []), *clauses):
+        seconds = duration(value)
+        if seconds is None or seconds == 0.0:
+            note_unread(tags, key if value == text else f"{key}:conditional", "no limit of stays")
+        elif seconds < LONGEST_LIMIT:
+            limits.append((seconds, when))
+    if not limits:
+        return None, limited
+    if len(limits) > 1:
+        note_unread(tags, f"{key}:conditional", "the shortest limit of stays")
+    return min(limits, key=lambda limit: limit[0])
+
+
+def _without_off(text: str) -> str:
+    return "; ".join(rule for rule in text.split("; ") if not rule.endswith(" off")) or text
 
 
 class AreaRule(NamedTuple):
@@ -379,8 +461,7 @@ def kerb_sides(
             closed = everything.closed_intervals(k, side)
             source, rule, capacity = "rule", CLASS_RULE, None
             if by_tag:
-                usable = {key: value for key, value in road.tags.items() if value not in RESERVED}
-                kerb = kerb_of(usable, tagged)
+                kerb = kerb_of(road.tags, tagged, reserved=True)
                 if isinstance(kerb, str):
                     left_out[kerb].append(f"{road.id}-{tagged}")
                 if kerb is None or isinstance(kerb, str):
@@ -424,7 +505,7 @@ def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> Faci
         return None
     orientation = tags.get("orientation", tags.get("parking:orientation", "parallel"))
     orientation = orientation if orientation in ARRANGEMENTS else "parallel"
-    tagged = whole_number(tags.get("capacity"))
+    tagged = count_in(tags, "capacity", "by the length of the kerb")
     capacity = tagged if tagged is not None else max(round((end - start) / METRES_PER_PLACE[orientation]), 1)
     middle = shapely.get_coordinates(shapely.centroid(area.polygon))[0]
     here, ahead = shapely.get_coordinates(
