@@ -84,7 +84,7 @@ def always() -> BoolArray:
 def week_of(text: str) -> Week | None:
     """Return the hours of an ordinary week; None if the text cannot be read."""
     with with_extra("hours of OpenStreetMap", "osm"):
-        from opening_hours import OpeningHours, ParserError
+        from opening_hours import OpeningHours, ParserError  # type: ignore[attr-defined]
 
     try:
         hours = OpeningHours(_plain(text))

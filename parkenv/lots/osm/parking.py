@@ -228,10 +228,14 @@ def kerb_of(tags: Mapping[str, str], side: Side, *, reserved: bool = False) -> K
         named = f"parking:lane={old}" if kind is None else f"parking={kind}, orientation={orientation}"
         return f"kerbs with {named}, which is not known"
     users, minutes = kerb_users(tags, side)
-    if users == FORBIDDEN or not minutes.any():
-        return "kerbs where parking is forbidden"
-    if users != PUBLIC and not reserved:
-        return f"kerbs for {users}"
+    if users == FORBIDDEN or not minutes.any() or (users != PUBLIC and not reserved):
+        named = {"restriction=": "parking:{}:restriction", "access=": "parking:{}:access"}
+        named = named if kind is not None else {"": "parking:condition:{}", " ": "parking:lane:{}"}
+        reasons = ((name, tags.get(kerb_tag(tags, text, side), "")) for name, text in named.items())
+        closed = (
+            f"{name.strip()}{value}" for name, value in reasons if users_of(value) not in (PUBLIC, None)
+        )
+        return f"kerbs with {next(closed, 'rules that forbid parking')}"
     keys = (
         ("parking:{}:capacity",) if kind is not None else ("parking:lane:{}:capacity", "parking:{}:capacity")
     )

@@ -264,9 +264,9 @@ def decisive_access(tags: Mapping[str, str], prefix: str = "") -> str | None:
 
 def closed_to_cars(tags: Mapping[str, str], *, private: bool = True) -> str | None:
     """Return the tag that excludes cars (the most specific access tag decides), or None."""
-    for key in NOT_CARS:
-        if tags.get(key) == "only":
-            return f"{key}=only"
+    for other in NOT_CARS:
+        if tags.get(other) == "only":
+            return f"{other}=only"
     key = decisive_access(tags)
     if key is not None:
         closed = {*NOT_CARS, "delivery", "official", "private"} if private else {*NOT_CARS}
