@@ -229,17 +229,20 @@ def kerb_of(tags: Mapping[str, str], side: Side, *, reserved: bool = False) -> K
         return f"kerbs with {named}, which is not known"
     users, minutes = kerb_users(tags, side)
     if users == FORBIDDEN or not minutes.any() or (users != PUBLIC and not reserved):
-        named = {"restriction=": "parking:{}:restriction", "access=": "parking:{}:access"}
-        named = named if kind is not None else {"": "parking:condition:{}", " ": "parking:lane:{}"}
-        reasons = ((name, tags.get(kerb_tag(tags, text, side), "")) for name, text in named.items())
+        new = {"restriction=": "parking:{}:restriction", "access=": "parking:{}:access"}
+        old_keys = {"": "parking:condition:{}", " ": "parking:lane:{}"}
+        by_name = new if kind is not None else old_keys
+        reasons = ((name, tags.get(kerb_tag(tags, text, side), "")) for name, text in by_name.items())
         closed = (
             f"{name.strip()}{value}" for name, value in reasons if users_of(value) not in (PUBLIC, None)
         )
         return f"kerbs with {next(closed, 'rules that forbid parking')}"
-    keys = (
+    counted_keys = (
         ("parking:{}:capacity",) if kind is not None else ("parking:lane:{}:capacity", "parking:{}:capacity")
     )
-    counts = (count_in(tags, kerb_tag(tags, text, side), "by the length of the kerb") for text in keys)
+    counts = (
+        count_in(tags, kerb_tag(tags, text, side), "by the length of the kerb") for text in counted_keys
+    )
     capacity = next((count for count in counts if count is not None), None)
     where = (
         kind
