@@ -526,7 +526,8 @@ def test_real_extracts_become_towns(path):
     pytest.importorskip("osmium", reason="the extra osm is not installed")
     town = import_town(path)
     lot = town.draft.lot()
-    assert float(town.draft.found[0].split("km, ")[1].split("%")[0]) >= 95.0
+    # Bollards close streets in the centre of Dortmund: 96.6 % without them.
+    assert float(town.draft.found[0].split("km, ")[1].split("%")[0]) >= 94.5
     elements = {e.id: e.tags for e in read_map(path).elements if e.tags.get("amenity") == "parking"}
     listed = {row["element"] for row in town.facilities} & set(elements)
     lost = {name for left in town.draft.left_out for name in left.ids}

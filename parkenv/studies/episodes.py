@@ -112,7 +112,9 @@ class EpisodeRunner:
         recorder = SearchRecorder(self.agent, steps=moments)
         result = simulate(self.env, self.agent, seed, (recorder, *observers))
         metrics = {
-            name: value for name, value in result.info.items() if name not in ("reward_terms", "scenario")
+            name: value
+            for name, value in result.info.items()
+            if name not in ("reward_terms", "scenario", "scenario_index")
         }
         state, scenario = self._state, self.scenario
         return SearchRecord(

@@ -62,7 +62,8 @@ PASSABLE = (
     *("height_restrictor", "width_restrictor", "arch", "bump_gate"),
 )
 """Values of `barrier` that let cars pass unless access tags say otherwise."""
-TICKET_GATE = "lift_gate"  # without access tags on a service road: of a car park, open to every car
+ASSUMED_OPEN = ("lift_gate", "gate", "swing_gate")
+"""Barriers that let cars pass on service roads if no tag says otherwise: ticket gates, or open by day."""
 BARRIER_GAP = 1.5  # m, between a barrier and the roads that end before it
 NOT_FOR_PARKING = ("drive-through", "emergency_access", "bus")
 """Kinds of `highway=service` that are not lanes."""
@@ -225,12 +226,10 @@ def _parts_between(
     near: Any = at.query_ball_point(road.points, NODE_TOLERANCE)
     for i, each in enumerate(near):
         for tags, name in ((barriers[k].tags, barriers[k].id) for k in each):
-            passes = road.rank is not Rank.STREET and _is_ticket_gate(tags)
+            passes = road.rank is not Rank.STREET and _assumed_open(tags)
             stops[i] |= not passes
             what = f"barrier={tags['barrier']}" if "barrier" in tags else str(closed_to_cars(tags))
-            reason = (
-                f"{what} on service roads, taken for a ticket gate" if passes else f"roads through {what}"
-            )
+            reason = f"{what} on service roads, taken for open" if passes else f"roads through {what}"
             met.setdefault(reason, {})[name] = None
     last = len(stops) - 1
     cuts = [i for i, stop in enumerate(stops) if stop or i in (0, last)]
@@ -244,8 +243,8 @@ def _parts_between(
     return parts
 
 
-def _is_ticket_gate(tags: Mapping[str, str]) -> bool:
-    return tags.get("barrier") == TICKET_GATE and not closed_to_cars(tags) and tags.get("locked") != "yes"
+def _assumed_open(tags: Mapping[str, str]) -> bool:
+    return tags.get("barrier") in ASSUMED_OPEN and not closed_to_cars(tags) and tags.get("locked") != "yes"
 
 
 ACCESS = ("motorcar", "motor_vehicle", "vehicle", "access")

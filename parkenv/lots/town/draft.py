@@ -145,13 +145,14 @@ class _TownImport(MapImport):
     def __init__(self, name: str, place: OsmMap, left_hand: bool) -> None:
         # What an extract's edge cuts may have lost its nodes, too.
         elements = [e.closed() if is_parking_area(e) and not e.is_node else e for e in place.elements]
-        elements = _with_nodes_in_areas(elements)
+        elements, merged = _with_nodes_in_areas(elements)
         streets = [e for e in elements if "highway" in e.tags and not e.is_node]
         if not streets:
             raise InputError("no street in it, want ways with the tag highway")
         refuse_far_away(streets)
         frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
         super().__init__(name, replace(place, elements=elements), frame)
+        self.left_out["car parks mapped as a point, too, within their outlines"] += merged
         self.streets, self.closed_roads = read_streets(elements, self.frame, left_hand)
         self.roads = self.streets.roads_of(self.streets.kept)
         self.lines = linestrings([road.points for road in self.roads])
@@ -424,28 +425,28 @@ class _TownImport(MapImport):
         return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows)
 
 
-def _with_nodes_in_areas(elements: Sequence[OsmElement]) -> list[OsmElement]:
-    """Return elements without nodes of car parks that their areas are, too, which have the tags of both.
+def _with_nodes_in_areas(elements: Sequence[OsmElement]) -> tuple[list[OsmElement], list[str]]:
+    """Return elements without nodes of car parks whose areas are mapped, too, and the ids of these nodes.
 
-    A node is another car park if both have a name, or both a kind, and these differ.
+    The areas have the tags of both. A node is another car park if both have a name, or both a kind, and these differ.
     """
     parking = [(i, e) for i, e in enumerate(elements) if is_parking_area(e) and e.lines]
     nodes = [(i, e) for i, e in parking if e.is_node]
     areas = [(i, e) for i, e in parking if not e.is_node and e.is_closed]
     if not nodes or not areas:
-        return list(elements)
+        return list(elements), []
     shapes = [shapely.make_valid(shapely.MultiPolygon([(r, []) for r in e.lines])) for _, e in areas]
     pairs = shapely.STRtree(shapes).query([shapely.Point(e.lines[0][0]) for _, e in nodes], "intersects").T
-    merged: list[OsmElement | None] = list(elements)
+    kept: list[OsmElement | None] = list(elements)
     for k, area in pairs.tolist():
         (own, node), (i, whole) = nodes[k], areas[area]
         same = all(
             node.tags.get(key, value) == value for key, value in whole.tags.items() if key in SAME_TAGS
         )
-        if same and merged[own] is not None:
-            merged[own] = None
-            merged[i] = replace(whole, tags={**node.tags, **(merged[i] or whole).tags})
-    return [e for e in merged if e is not None]
+        if same and kept[own] is not None:
+            kept[own] = None
+            kept[i] = replace(whole, tags={**node.tags, **(kept[i] or whole).tags})
+    return [e for e in kept if e is not None], [e.id for (i, e) in nodes if kept[i] is None]
 
 
 def _unseen_garages(
