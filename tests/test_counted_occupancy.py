@@ -1,10 +1,12 @@
 """Worlds that follow the counts of a car park."""
 
+from datetime import datetime, timedelta
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from car_park_counts import CURVE, write_counts
-from command_line import ran, refused, summary_of
+from command_line import ran, refused, rows_in, summary_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -156,7 +158,8 @@ DAY = "2024-01-29"
     [
         (["--car-park", "P9", "--replay-from", DAY], "'P9'"),
         (["--car-park", "P0", "--replay-from", "2024-01-03"], "2024-01-08"),
-        (["--car-park", "P0"], "car_parks only together with"),
+        ([], "has 3 car parks, want --car-park, one of P0, P1, empty"),
+        (["--car-park", "P0", "--capacity", 90], "has a column 'capacity', want no --capacity"),
         (["--car-park", "P0", "--replay-from", DAY, "--forecast-from", "others"], "rolling or past"),
     ],
 )
@@ -164,3 +167,21 @@ def test_what_counts_cannot_do_is_refused(tmp_path, options, message):
     file = write_counts(tmp_path / "counts.csv")
     words = ("compare", "--scenario", "mini", "--occupancy", file, *options)
     assert message in refused(*words, "--out", tmp_path / "out")
+
+
+def test_a_saturday_as_usual_needs_times_free_places_and_their_number_only(tmp_path):
+    table = tmp_path / "export.csv"
+    begin = datetime(2024, 5, 1)
+    hours = [begin + timedelta(hours=h) for h in range(24 * 28)]
+    full = [0.9 if time.weekday() == 5 and 9 <= time.hour < 18 else 0.3 for time in hours]
+    lines = [
+        f"{time:%d.%m.%Y %H:%M};{120 * (1 - share):.0f}" for time, share in zip(hours, full, strict=True)
+    ]
+    table.write_text("\n".join(["Zeit;frei", *lines]), encoding="utf-8")
+    words = ("compare", "--scenario", "mini", "--occupancy", table, "--days", "sat", "--hours", "11:00-15:00")
+    words += ("--agents", "first-free,belief", "-n", 3, "--jobs", 1, "--out", tmp_path / "out")
+    assert "want the number of places (a column capacity, or --capacity)" in refused(*words)
+    ran(*words, "--capacity", 120)
+    rows = rows_in(tmp_path / "out" / "episodes.csv")
+    assert {row["day"] for row in rows} <= {"2024-05-04", "2024-05-11", "2024-05-18", "2024-05-25"}
+    assert np.mean([float(row["occupancy"]) for row in rows]) == pytest.approx(0.9, abs=0.1)

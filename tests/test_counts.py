@@ -5,9 +5,12 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
+from scipy.special import logit
 
 from parkenv import InputError
-from parkenv.forecast.counts import Counts, is_counts
+from parkenv.forecast.count_table import is_counts
+from parkenv.forecast.counts import Counts
+from parkenv.forecast.usual_days import usual_days
 
 CAPACITY = 200
 FIRST = date(2024, 3, 1)
@@ -196,12 +199,24 @@ HEADER = "car_park,capacity,hour,free\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a,b\n1,2\n", "want the columns car_park,capacity,hour,free"),
+        (
+            "a,b\n1,2\n",
+            "'a, b', of neither .*: want a column of times .*; a column of free .*; the number of places",
+        ),
+        ("Zeit;frei\n", "'Zeit, frei', want the number of places .a column capacity, or --capacity"),
+        ("Zeit;Kapazität\n", "'Zeit, Kapazität', want a column of free or taken places"),
+        ("time,zeit,free,capacity\n", "'time' and 'zeit' say the same"),
+        ("hour,time,free,capacity\n", "several columns of times"),
+        ("datum;frei;capacity\n01.03.2024;3;9\n", "line 2 is .*, want a time such as"),
+        ("zeit;frei;capacity\n01/03/2024 07:00;3;9\n", "line 2 is .*, want a time such as"),
+        ("zeit;frei;capacity\n01.03.2024 07:00;1.203;1600\n", "has the number '1.203', want whole numbers"),
+        ('time,free,capacity\n2024-03-01 07:00,"1,203",1600\n', "line 2 is .*, and numbers"),
         (HEADER, "has no readings"),
-        (HEADER + "a,100,yesterday,5\n", "line 2 is .*, want an ISO time and numbers"),
-        (HEADER + "a,100,2024-01-01T00,five\n", "line 2 is .*, want an ISO time and numbers"),
-        (HEADER + "a,100,0001-01-01,5\na,100,9999-12-31,5\n", "over 3,652,059 days, want at"),
-        (HEADER + "\x1bred,100,2024-01-01,5\n", "want a printable name"),
+        (HEADER + "a,100,yesterday,5\n", "line 2 is .*, want a time such as"),
+        (HEADER + "a,100,2024-01-01,5\n", "line 2 is .*, want a time such as"),
+        (HEADER + "a,100,2024-01-01T00,five\n", "line 2 is .*, and numbers"),
+        (HEADER + "a,100,0001-01-01T00,5\na,100,9999-12-31T00,5\n", "over 3,652,059 days, want at"),
+        (HEADER + "\x1bred,100,2024-01-01T00,5\n", "want a printable name"),
     ],
 )
 def test_other_files_are_refused(tmp_path, text, message):
@@ -218,3 +233,69 @@ def test_unknown_names_are_refused(tmp_path):
         counts.chosen(["center"])
     with pytest.raises(InputError, match="timezone is 'Berlin'"):
         Counts.read(tmp_path / "counts.csv", "Berlin")
+
+
+DIALECTS = {
+    "semicolons and German names": ("Zeit;frei", "{:%d.%m.%Y %H:%M};{free:.0f}"),
+    "tabs and taken places": ("timestamp\toccupied", "{:%Y-%m-%dT%H:%M:%S}\t{taken:.0f}"),
+    "a date and a time of day": ("Datum;Uhrzeit;belegte Plätze", "{:%d.%m.%Y;%H:%M};{taken:.0f}"),
+    "a decimal comma": ("Zeitpunkt;frei", "{:%Y-%m-%d %H:%M};{free:.0f},0"),
+}
+
+
+@pytest.mark.parametrize(("header", "row"), DIALECTS.values(), ids=DIALECTS)
+def test_tables_of_times_and_places_are_read_with_a_capacity(tmp_path, header, row):
+    """A reading at a time holds for the end of the hour before it."""
+    free = free_places(3)
+    rows = [
+        row.format(
+            datetime(2024, 3, 1) + timedelta(days=d, hours=h + 1),
+            free=free[d, h],
+            taken=CAPACITY - free[d, h],
+        )
+        for d in range(3)
+        for h in range(24)
+    ]
+    counts = read(tmp_path, rows, header, capacity=CAPACITY)
+    assert counts.car_parks == ("counts",)
+    np.testing.assert_allclose(counts.occupied[0], 1 - free / CAPACITY)
+
+
+def test_free_and_taken_places_are_the_capacity(tmp_path):
+    counts = read(tmp_path, ["2024-03-01T08:00;30;70", "2024-03-01T09:00;20;80"], "hour;free;taken")
+    np.testing.assert_allclose(counts.occupied[0, 0, 8:10], [0.7, 0.8])
+    np.testing.assert_array_equal(counts.capacity, 100)
+
+
+def test_a_capacity_belongs_to_one_car_park_without_its_own(tmp_path):
+    rows = ["a,2024-03-01T08,30", "b,2024-03-01T08,30"]
+    with pytest.raises(InputError, match="has 2 car parks, want a column of their capacities"):
+        read(tmp_path, rows, "car_park,hour,free", capacity=90)
+    with pytest.raises(InputError, match="has a column 'capacity', want no --capacity"):
+        read(tmp_path, [f"a,90,{rows[0][2:]}"], capacity=90)
+
+
+def test_usual_days_are_those_of_their_class_without_the_day_itself(tmp_path):
+    counts = read(tmp_path, rows_of(free_places(30)))
+    y = counts.occupied[0]
+    mean, sd = usual_days(y, counts.weekday, "counts")
+    saturdays = np.flatnonzero(counts.weekday == 5)
+    others = logit(y[saturdays[1:]])
+    np.testing.assert_allclose(mean[saturdays[0]], others.mean(axis=0))
+    n = len(others)
+    variance = (2 * 0.8**2 + others.var(axis=0) * n) / (n + 1) * (1 + 1 / n)
+    np.testing.assert_allclose(sd[saturdays[0]], np.sqrt(variance))
+    changed = np.where(np.arange(30)[:, None] == saturdays[0], 0.01, y)
+    again, _ = usual_days(changed, counts.weekday, "counts")
+    np.testing.assert_array_equal(again[saturdays[0]], mean[saturdays[0]])
+    assert (again[saturdays[1]] < mean[saturdays[1]]).any()
+
+
+def test_usual_days_need_another_day_and_fill_hours_without_a_reading():
+    y = np.full((2, 24), np.nan)
+    y[:, 8:20] = 0.5
+    mean, sd = usual_days(y, np.array([0, 5]), "counts")
+    np.testing.assert_allclose(mean, 0.0, atol=1e-12)
+    assert np.isfinite(sd).all()
+    with pytest.raises(InputError, match="counted on 1 days, want at least two"):
+        usual_days(y[:1], np.array([0]), "counts")

@@ -68,9 +68,3 @@ def test_a_fit_states_day_errors_drift_and_faults(tmp_path):
 def test_what_does_not_fit_is_refused_in_a_line(tmp_path, options, message):
     counts = write(tmp_path / "counts.csv", 2)
     assert message in refused("occupancy", "evaluate", counts, *options, "--out", tmp_path / "out")
-
-
-def test_counts_as_a_log_of_slots_are_refused(tmp_path):
-    counts = write(tmp_path / "counts.csv", 2)
-    said = refused("compare", "--scenario", "mini", "--occupancy", counts, "--out", tmp_path / "out")
-    assert "has counts of car parks, want --car-park with it" in said

@@ -36,6 +36,11 @@ SCORE_COLUMNS = (
 )
 LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
 TimeZone = Annotated[str, Option(takes="NAME")]
+Capacity = Annotated[
+    float | None,
+    Option(takes="PLACES"),
+    Field(gt=0, le=1e6, description="Places of the car park, for counts without such a column."),
+]
 
 
 class Fit(Command):
@@ -64,6 +69,7 @@ class Fit(Command):
         2.0, "Observations of a log that are farther apart than this, h, are independent.", takes="H", ge=0
     )
     timezone: TimeZone = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
+    capacity: Capacity = None
     out: Path = option(
         Path("results/occupancy"),
         "Folder for summary.json and, for a log, process.json and rates.png.",
@@ -81,6 +87,7 @@ class Fit(Command):
                 self.out,
                 max_gap_s=3600.0 * self.max_gap_h,
                 timezone=self.timezone,
+                capacity=self.capacity,
                 progress=progress,
             )
         _show(console, report, self.out, None, COLUMNS)
@@ -109,6 +116,7 @@ class Evaluate(Command):
     )
     car_parks: Axis[str] | None = option(None, "Car parks.", takes="NAME[,...]", default="all")
     timezone: TimeZone = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
+    capacity: Capacity = None
     seed: Seed = Field(0, description="Seed of the bootstrap.")
     out: Path = option(
         Path("results/forecasts"), "Folder for summary.json and a picture of each model.", short="-o"
@@ -126,6 +134,7 @@ class Evaluate(Command):
                 from_day=self.from_day,
                 car_parks=self.car_parks,
                 timezone=self.timezone,
+                capacity=self.capacity,
                 seed=self.seed,
                 progress=progress,
             )

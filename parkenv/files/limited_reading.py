@@ -19,6 +19,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any
 from xml.etree import ElementTree
@@ -208,11 +209,15 @@ def read_xml(path: str | Path, root: str, most: int = MAX_BYTES // 4) -> Element
 
 
 def csv_rows(path: str | Path, most: int = MAX_BYTES) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows of a CSV file that are not empty, with their line numbers; all are as wide as the first."""
+    """Yield the rows of a CSV file that are not empty, with their line numbers; all are as wide as the first.
+
+    The first line tells what separates fields: commas, semicolons or tabs.
+    """
     width = 0
     with open_limited(path, most) as file:
         text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
-        reader = csv.reader(text)
+        first = text.readline()
+        reader = csv.reader(chain([first], text), delimiter=max(",;\t", key=first.count))
         try:
             for row in reader:
                 width = width or len(row)

@@ -2,8 +2,8 @@
 
 A file has the columns `car_park,capacity,free` and `hour` (local time), the hour at whose end the reading holds, or
 `time`, the moment of the reading: one of 09:00 sharp holds for the end of the hour before it. `hour_utc` and `time_utc`
-are the same in UTC. Real counts have faults. Each reading that is changed or dropped is counted under the name of its
-rule:
+are the same in UTC; `taken` may stand for `free` (see `count_table`). Real counts have faults. Each reading that is
+changed or dropped is counted under the name of its rule:
 
 - `negative`: below 0. Down to -5 % of the capacity it counts as full, below that it is dropped.
 - `above_capacity`: more free places than places. Up to 5 % it counts as empty, above that it is dropped (unless
@@ -28,7 +28,6 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -36,18 +35,9 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError, nearest
-from parkenv.files.limited_reading import csv_rows
+from parkenv.forecast.count_table import Readings, read_table
 
 HOURS = 24
-TIME_COLUMNS = ("hour", "hour_utc", "time", "time_utc")
-"""Names of the column that says when a reading was taken."""
-MAX_COUNT_BYTES = 512_000_000
-"""Maximum size of a file of counts, unpacked."""
-MAX_NAME = 200
-"""Maximum length of a car park's name, characters."""
-MAX_DAYS = 400_000
-"""Maximum number of car parks times days of a file of counts."""
-_AN_INSTANT = timedelta(microseconds=1)
 _TOLERANCE = 0.05  # of the capacity
 _SURPRISE = math.log(1e9)
 _WINDOW = 28  # days
@@ -69,17 +59,19 @@ class Counts:
     source: str = "counts"  # name of the file in messages
 
     @classmethod
-    def read(cls, path: str | Path, timezone: str = "Europe/Berlin") -> Counts:
+    def read(cls, path: str | Path, timezone: str = "Europe/Berlin", capacity: float | None = None) -> Counts:
         """Read and clean a file of counts, .csv or .csv.gz.
 
-        `timezone`, an IANA name, is the local time of `hour_utc` and `time_utc`, and of when summer time begins and
-        ends.
+        Args:
+            path: a table, see `count_table`.
+            timezone: IANA name of the local time of `hour_utc` and `time_utc`, and of the days of summer time.
+            capacity: places of the only car park of a table without such a column.
         """
         try:
             zone = ZoneInfo(timezone)
         except (KeyError, ValueError, OSError) as error:
             raise InputError(f"timezone is {timezone!r}, want an IANA name such as Europe/Berlin") from error
-        return _cleaned(_read(path, zone), zone, str(path))
+        return _cleaned(read_table(path, zone, capacity), zone, str(path))
 
     @cached_property
     def weekday(self) -> NDArray[np.int64]:
@@ -120,86 +112,7 @@ class Counts:
         return Counts(names, self.days[days], capacity, occupied, seen, faults, self.source)
 
 
-def is_counts(path: str | Path) -> bool:
-    _, header = next(csv_rows(path, MAX_COUNT_BYTES), (0, []))
-    return {"car_park", "free"} <= set(header)
-
-
-class _Readings(NamedTuple):
-    car_parks: tuple[str, ...]
-    first: date
-    n_days: int
-    park: NDArray[np.int64]
-    day: NDArray[np.int64]
-    hour: NDArray[np.int64]
-    capacity: FloatArray
-    free: FloatArray
-
-
-def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
-    rows = csv_rows(path, MAX_COUNT_BYTES)
-    _, header = next(rows, (0, []))
-    time = next((name for name in TIME_COLUMNS if name in header), "hour")
-    try:
-        columns = [header.index(name) for name in ("car_park", "capacity", time, "free")]
-    except ValueError:
-        wanted = f"car_park,capacity,hour,free (or {', '.join(TIME_COLUMNS[1:])} for hour)"
-        raise InputError(f"{path}: want the columns {wanted}") from None
-    utc, before = time.endswith("_utc"), _AN_INSTANT if time.startswith("time") else timedelta(0)
-    names: dict[str, int] = {}
-    times: dict[str, tuple[int, int, float]] = {}
-    numbers: dict[str, float] = {}
-    table: list[tuple[int, int, int, float, float, float]] = []
-    for line, row in rows:
-        name, capacity, moment, free = (row[i] for i in columns)
-        if name not in names and not (0 < len(name) <= MAX_NAME and name.isprintable()):
-            raise InputError(f"{path}: line {line}: car_park is {name!a:.40}, want a printable name")
-        try:
-            if moment not in times:
-                times[moment] = _local_hour(moment, zone, utc, before)
-            for text in (capacity, free):
-                if text not in numbers:
-                    numbers[text] = float(text) if text.strip() else math.nan
-        except (ValueError, OverflowError):
-            raise InputError(
-                f"{path}: line {line} is {','.join(row)!r:.80}, want an ISO time and numbers"
-            ) from None
-        table.append((names.setdefault(name, len(names)), *times[moment], numbers[capacity], numbers[free]))
-    if not table:
-        raise InputError(f"{path}: has no readings, want at least one")
-    values = np.array(table, float)
-    newest_first = values[0, 3] > values[-1, 3]
-    values = values[::-1] if newest_first else values
-    values = values[np.argsort(values[:, 3], kind="stable")]
-    rank = np.unique(list(names), return_inverse=True)[1]
-    days = values[:, 1].astype(np.int64)
-    n_days = int(days.max() - days.min()) + 1
-    if n_days * len(names) > MAX_DAYS:
-        raise InputError(
-            f"{path}: has {len(names):,} car parks over {n_days:,} days, want at most {MAX_DAYS:,} in all"
-        )
-    return _Readings(
-        tuple(sorted(names)),
-        date.fromordinal(int(days.min())),
-        n_days,
-        rank[values[:, 0].astype(np.int64)],
-        days - days.min(),
-        values[:, 2].astype(np.int64),
-        values[:, 4],
-        values[:, 5],
-    )
-
-
-def _local_hour(text: str, zone: ZoneInfo, utc: bool, before: timedelta) -> tuple[int, int, float]:
-    """Return the day (proleptic Gregorian ordinal), the hour and the Unix time of the time `before` a given one."""
-    moment = datetime.fromisoformat(text) - before
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC if utc else zone)
-    moment = moment if moment.tzinfo is zone else moment.astimezone(zone)
-    return moment.toordinal(), moment.hour, moment.timestamp()
-
-
-def _cleaned(readings: _Readings, zone: ZoneInfo, source: str) -> Counts:
+def _cleaned(readings: Readings, zone: ZoneInfo, source: str) -> Counts:
     days = tuple(readings.first + timedelta(i) for i in range(readings.n_days))
     changes = _summer_time(days, zone)
     stated, free, duplicates = _by_hour(readings, changes)
@@ -253,9 +166,7 @@ def _summer_time(days: tuple[date, ...], zone: ZoneInfo) -> dict[int, int]:
     return changes
 
 
-def _by_hour(
-    readings: _Readings, changes: dict[int, int]
-) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+def _by_hour(readings: Readings, changes: dict[int, int]) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     """Return capacities (c, d), the last of each day, readings (c, d, 24), and the number of duplicates (c,)."""
     c, d = len(readings.car_parks), readings.n_days
     usable = np.isfinite(readings.free) & (readings.capacity > 0) & np.isfinite(readings.capacity)

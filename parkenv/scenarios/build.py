@@ -226,12 +226,12 @@ def _lot(spec: LotSpec) -> ParkingLot:
 
 def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyModel:
     if spec.log is not None:
-        from parkenv.forecast.counts import is_counts
+        from parkenv.forecast.count_table import is_counts
         from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping, same_slots
 
         if is_counts(spec.log[0]):
             raise InputError(
-                f"{spec.log[0]}: has counts of car parks, want --car-park with it, or a table `counts`"
+                f"{spec.log[0]}: is not a log of slots; want a table `counts` for counts of car parks"
             )
         log = _log(tuple(spec.log), tuple(map(_changed, spec.log)))
         mapped = None
@@ -243,7 +243,6 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
             log, lot.walk_m(goal), mapped, spec.replay_from, spec.forecast_from or "others"
         )
     if spec.counts is not None:
-        assert spec.replay_from is not None
         return _counted(spec.counts, spec.replay_from, spec.forecast_from == "past", lot, goal)
     if spec.world is not None:
         return _own_world(spec.world, lot, goal)
@@ -274,21 +273,37 @@ def _own_world(text: str, lot: ParkingLot, goal: int) -> OccupancyModel:
     return made
 
 
-def _counted(spec: CountsSpec, first: date, past: bool, lot: ParkingLot, goal: int) -> CountedOccupancy:
+def _counted(
+    spec: CountsSpec, first: date | None, past: bool, lot: ParkingLot, goal: int
+) -> CountedOccupancy:
+    from parkenv.forecast.usual_days import usual_days
     from parkenv.world.occupancy.counted import CountedOccupancy
 
-    counts, forecast = _forecast_counts(spec.file, _changed(spec.file), spec.timezone, first, past)
-    if spec.car_park not in counts.car_parks:
-        counts.chosen([spec.car_park])  # says which names there are
-    row, days = counts.car_parks.index(spec.car_park), slice(forecast.first, None)
+    counts = _counts(spec.file, _changed(spec.file), spec.timezone, spec.capacity)
+    name = spec.car_park
+    if name is None:
+        name = counts.car_parks[0]
+        if len(counts.car_parks) > 1:
+            among = ", ".join(counts.car_parks[:5]) + (", ..." if len(counts.car_parks) > 5 else "")
+            raise InputError(
+                f"{spec.file}: has {len(counts.car_parks)} car parks, want --car-park, one of {among}"
+            )
+    elif name not in counts.car_parks:
+        counts.chosen([name])  # says which names there are
+    row, start, source = counts.car_parks.index(name), 0, f"{spec.file}: car park {name}"
+    if first is None:
+        mean, sd = usual_days(counts.occupied[row], counts.weekday, source)
+    else:
+        forecast = _forecast(spec.file, _changed(spec.file), spec.timezone, spec.capacity, first, past)
+        start, mean, sd = forecast.first, forecast.mean[row], forecast.sd[row]
     return CountedOccupancy(
-        tuple(day.isoformat() for day in counts.days[days]),
-        counts.occupied[row, days],
-        forecast.mean[row],
-        forecast.sd[row],
+        tuple(day.isoformat() for day in counts.days[start:]),
+        counts.occupied[row, start:],
+        mean,
+        sd,
         attraction(lot, goal, spec.pull, spec.unevenness),
         spec.mean_stay_s,
-        f"{spec.file}: car park {spec.car_park}",
+        source,
     )
 
 
@@ -305,31 +320,31 @@ def _log(files: tuple[Path, ...], changed: tuple[int, ...]) -> OccupancyLog:  # 
 
 
 @lru_cache(maxsize=2)
-def _forecast_counts(
-    file: Path,
-    changed: int,  # noqa: ARG001
-    timezone: str,
-    first: date,
-    past: bool,
-) -> tuple[Counts, DayForecast]:
-    """Read counts and forecast all days from the first one on; car parks learn special days from one another."""
+def _counts(file: Path, changed: int, timezone: str, capacity: float | None) -> Counts:  # noqa: ARG001
     from parkenv.forecast.counts import Counts
+
+    return Counts.read(file, timezone, capacity)
+
+
+@lru_cache(maxsize=2)
+def _forecast(
+    file: Path, changed: int, timezone: str, capacity: float | None, first: date, past: bool
+) -> DayForecast:
+    """Forecast all days from the first one on; car parks learn special days from one another."""
     from parkenv.forecast.day_curves import CurveSettings, forecast_days
 
-    counts = Counts.read(file, timezone)
+    counts = _counts(file, changed, timezone, capacity)
     index = counts.day_index(first)
     if not MIN_PAST_DAYS <= index < len(counts.days):
         raise InputError(
             f"{file}: replay_from is {first}, want one from {counts.days[0] + timedelta(MIN_PAST_DAYS)} to "
             f"{counts.days[-1]}: the forecast needs {MIN_PAST_DAYS} days before it"
         )
-    return counts, forecast_days(counts, index, "past" if past else "rolling", CurveSettings())
+    return forecast_days(counts, index, "past" if past else "rolling", CurveSettings())
 
 
-def car_parks(file: Path) -> list[str]:
-    from parkenv.forecast.counts import Counts
-
-    counts = Counts.read(file)
+def car_parks(file: Path, capacity: float | None = None) -> list[str]:
+    counts = _counts(file, _changed(file), "Europe/Berlin", capacity)
     return [name for name in counts.car_parks if name not in counts.idle()]
 
 

@@ -210,6 +210,9 @@ def _day_error_text(text: str) -> object:
     return dict(zip(("level", "slope"), numbers_in(text, min(text.count(",") + 1, 2)), strict=False))
 
 
+_Capacity = Annotated[float, Field(gt=0, le=1e6)]
+
+
 class CountsSpec(_Popularity):
     """Days of a car park of which the number of free places was counted every hour, replayed on the lot."""
 
@@ -217,7 +220,8 @@ class CountsSpec(_Popularity):
         description="Counts: car_park,capacity,hour,free, each at its hour's end, or `time` for points in "
         "time; .csv, .csv.gz."
     )
-    car_park: str = Field(description="Name of the car park in the file.")
+    car_park: str | None = Field(None, description="Name of the car park in the file, if there are several.")
+    capacity: _Capacity | None = Field(None, description="Places of the car park, if no column has them.")
     timezone: str = Field("Europe/Berlin", description="Local time zone, for `hour_utc` and `time_utc`.")
 
 
@@ -242,12 +246,20 @@ class OccupancySpec(Spec):
     counts: CountsSpec | None = None
     car_parks: Several[str] | None = option(
         None,
-        "With --occupancy as a file of hourly counts, car_park,capacity,hour,free: replay the days of these car parks "
+        "With --occupancy as a file of counts, car_park,capacity,hour,free: replay the days of these car parks "
         "on the lot, each as a separate scenario. all: all car parks in use.",
         name="--car-park",
         takes="NAME[,NAME...]|all",
         panel="World",
+        default="the file's only one",
         parse=words_in,
+    )
+    capacity: _Capacity | None = option(
+        None,
+        "Places of the car park, for counts without such a column, such as a table of times and free places.",
+        takes="PLACES",
+        panel="World",
+        default="the file's",
     )
     world: str | None = Field(
         None,
@@ -256,7 +268,7 @@ class OccupancySpec(Spec):
     )
     replay_from: Date | None = option(
         None,
-        "First replayed day of the log or the counts.",
+        "First replayed day of the log or the counts; without it, days are drawn from all.",
         takes="DATE",
         panel="World",
         default="the scenario's, all",
@@ -266,7 +278,7 @@ class OccupancySpec(Spec):
         "Days used for the forecast. past: those before the first replayed day; rolling: those "
         "before the earliest that a world replays; others: all that it does not replay.",
         panel="World",
-        default="the scenario's; others, with counts rolling",
+        default="the scenario's; others, with counts and --replay-from rolling",
     )
     mapping: Annotated[Path | str, BeforeValidator(_mapping)] | None = option(
         None,
@@ -301,18 +313,14 @@ class OccupancySpec(Spec):
                 "day_error only without a log or counts, whose days differ by themselves",
             ),
             (
-                self.car_parks and not (self.log and dated),
-                "car_parks only together with counts as the log, and replay_from",
+                (self.car_parks or self.capacity) and not self.log,
+                "car_parks and capacity only together with counts as the log",
             ),
             (self.mapping is not None and not self.log, "mapping only together with a log"),
             (dated and not recorded, "replay_from only together with a log or counts"),
             (
-                self.counts and not dated,
-                "replay_from together with counts: the forecast needs days before it",
-            ),
-            (
-                self.counts and self.forecast_from == "others",
-                "forecast_from rolling or past together with counts",
+                self.counts and dated and self.forecast_from == "others",
+                "forecast_from rolling or past together with counts and replay_from",
             ),
             (self.forecast_from not in (None, "others") and not dated, "forecast_from only with replay_from"),
             (self.event and recorded, "event only without a log or counts, whose days have their events"),
@@ -661,8 +669,8 @@ class ScenarioSpec(Spec):
     entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
     occupancy: Annotated[OccupancySpec, _from_text(_occupancy_table), OrText()] = option(
         OccupancySpec(),
-        "States of the slots: recorded logs (.csv, .csv.gz) of the same slots, replayed day by "
-        "day; a process of `parkenv occupancy fit` (.json); or your own world, MODULE:CLASS.",
+        "States of the slots: recorded logs (.csv, .csv.gz) of the same slots or counts of a car park, replayed day "
+        "by day; a process of `parkenv occupancy fit` (.json); or your own world, MODULE:CLASS.",
         takes="FILE[,FILE...]|MODULE:CLASS",
         panel="World",
         default="the scenario's",

@@ -14,6 +14,7 @@ from parkenv.files.known_names import SCENARIO_NAMES, RigName
 from parkenv.files.limited_reading import is_there
 from parkenv.files.option import Inside, Option, seconds_of_minutes, words_in
 from parkenv.files.spec_file import Axis, DetectorName, OrText, Several, require_together
+from parkenv.forecast.count_table import is_counts
 from parkenv.scenarios.spec import (
     ScenarioSpec,
     TrafficSpec,
@@ -52,21 +53,27 @@ def _with_folders(value: object, info: ValidationInfo) -> object:
 
 
 def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...]:
-    """Replace scenarios that replay several car parks of a file of counts by one for each."""
+    """Replace scenarios that replay a file of counts by one for each of its car parks that are named."""
     listed: list[ScenarioSpec] = []
     for scenario in scenarios:
-        names, file = scenario.occupancy.car_parks, (scenario.occupancy.log or (None,))[0]
-        if names is None or file is None:
+        names, files = scenario.occupancy.car_parks, scenario.occupancy.log or ()
+        if len(files) != 1 or (names is None and not is_counts(files[0])):
             listed.append(scenario)
             continue
+        counts: dict[str, Any] = {"file": files[0], "capacity": scenario.occupancy.capacity}
         if names == ("all",):
             from parkenv.scenarios.build import car_parks
 
-            names = tuple(car_parks(file))
-        for name in names:
-            title = file_name(f"{scenario.title} {name}").replace(",", " ")[:80]
-            counts = {"file": file, "car_park": name}
-            occupancy = scenario.occupancy.changed("--car-park", log=None, car_parks=None, counts=counts)
+            names = tuple(car_parks(**counts))
+        for name in names or (None,):
+            title = (
+                scenario.title
+                if name is None
+                else file_name(f"{scenario.title} {name}").replace(",", " ")[:80]
+            )
+            occupancy = scenario.occupancy.changed(
+                "--car-park", log=None, car_parks=None, capacity=None, counts={**counts, "car_park": name}
+            )
             listed.append(scenario.changed("--car-park", name=title, occupancy=occupancy, forecast="own"))
     return tuple(listed)
 

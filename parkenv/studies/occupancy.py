@@ -12,7 +12,8 @@ import numpy as np
 
 from parkenv.errors import InputError
 from parkenv.forecast.comparison import MODELS, Compared, compare
-from parkenv.forecast.counts import Counts, is_counts
+from parkenv.forecast.count_table import is_counts
+from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
 from parkenv.forecast.slot_comparison import ComparedSlots, compare_slot_days
 from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
@@ -31,9 +32,11 @@ class FitReport(NamedTuple):
     notes: Sequence[str] = ()  # faults of the data, and what the rows leave out
 
 
-def fit(log: Path, folder: Path, *, max_gap_s: float, timezone: str, progress: Progress) -> FitReport:
+def fit(
+    log: Path, folder: Path, *, max_gap_s: float, timezone: str, capacity: float | None, progress: Progress
+) -> FitReport:
     if is_counts(log):
-        return _fit_counts(Counts.read(log, timezone), progress)
+        return _fit_counts(Counts.read(log, timezone, capacity), progress)
     progress("Fitting rates", 0, 0)
     fitted = fit_process(OccupancyLog.read(log), max_gap_s=max_gap_s)
     process = fitted.process
@@ -104,12 +107,13 @@ def evaluate(
     from_day: date | None,
     car_parks: Sequence[str] | None,
     timezone: str,
+    capacity: float | None,
     seed: int,
     progress: Progress,
 ) -> FitReport:
     if not is_counts(log):
         return _evaluate_log(log, folder, from_day, seed, progress)
-    counts = Counts.read(log, timezone)
+    counts = Counts.read(log, timezone, capacity)
     counts = counts if car_parks is None else counts.chosen(list(car_parks))
     n = len(counts.days)
     first = n // 2 if from_day is None else counts.day_index(from_day)

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar, get_args
 from urllib.parse import urlsplit
@@ -143,8 +144,9 @@ class Workers:
             pre_dispatch="2*n_jobs",
             **worker_start(),
         )
+        folder = Path.cwd()  # workers of an earlier run may have started in another one
         with _interrupts_blocked():
-            results = parallel(delayed(_numbered)(i, task) for i, task in tasks.items())
+            results = parallel(delayed(_numbered)(i, task, folder) for i, task in tasks.items())
         with closing(results):
             yield from results
 
@@ -295,7 +297,9 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _numbered(number: int, task: Task[Result]) -> tuple[int, Result]:
+def _numbered(number: int, task: Task[Result], folder: Path | None = None) -> tuple[int, Result]:
+    if folder is not None:
+        os.chdir(folder)
     try:
         return number, task()
     except SystemError as error:
