@@ -7,6 +7,7 @@ parallel form, which advances by ticks. Both need the extra `multi`: `pip instal
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
@@ -88,6 +89,8 @@ class _CarsAsAgents:
         self._seed: int | None = None
         self._episode = 0
         self._renderer: FleetRenderer | None = None
+
+    __copy__ = deepcopy
 
     def observation_space(self, agent: str) -> spaces.Dict:
         """Return the space of an agent's observations, always the same object; that of `parkenv/Search-v2`."""
@@ -186,7 +189,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
 
     ## Rewards
     Minus the duration of a car's step, s, as in `parkenv/Search-v2`, given when the step is over; parking also
-    subtracts the walk to the goal and the slot's parking cost. `infos[agent]["reward_terms"]` holds the terms. A car's
+    subtracts the walk to the goal and the slot's parking cost. `infos[agent]` holds the parts. A car's
     return is minus its total time. One car's gain may be the others' loss: the sum over cars is the social cost.
 
     ## Starting state
@@ -344,7 +347,7 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
         self._infos = {agent: self._blank_info(_car_of(agent)) for agent in self.agents}
         self._tick = 0
         self._advance({}, {})
-        return dict(self._observations), dict(self._infos)
+        return _copies(self._observations), _copies(self._infos)
 
     def step(
         self, actions: dict[str, Any]
@@ -376,8 +379,7 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
         self._advance(rewards, over)
         cut = self._tick >= self.max_cycles
         truncated = {agent: cut and not over[agent] for agent in self.agents}
-        observations: dict[str, Observation] = dict(self._observations)
-        results = observations, rewards, over, truncated, dict(self._infos)
+        results = _copies(self._observations), rewards, over, truncated, _copies(self._infos)
         self.agents = [agent for agent in self.agents if not (over[agent] or truncated[agent])]
         self._observations = {agent: self._observations[agent] for agent in self.agents}
         self._infos = {agent: self._infos[agent] for agent in self.agents}
@@ -415,6 +417,14 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
         if outcome.begun:
             rewards[agent], self._infos[agent] = outcome.reward, outcome.info
             over[agent] = int(self.fleet.cars["state"][car]) not in (SEARCHING, TRUNCATED)
+
+
+def _copies(of_agents: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Copy observations or infos, some of which are handed out again at later ticks."""
+    return {
+        agent: {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in own.items()}
+        for agent, own in of_agents.items()
+    }
 
 
 raw_env, parallel_env = LotEnv, LotParallelEnv

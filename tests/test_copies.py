@@ -86,6 +86,48 @@ class Learner(Batch):
         return *super().step(action), self.envs.action_masks()
 
 
+class Cars:
+    """Many cars, decided for from outside, in both forms of PettingZoo's interface."""
+
+    def __init__(self):
+        from parkenv import lot_v0
+
+        options = {"scenario": "mini", "cars": 3, "knows": "reserve"}
+        self.one_by_one, self.at_once = lot_v0.raw_env(**options), lot_v0.parallel_env(**options)
+
+    def reset(self, seed):
+        self.one_by_one.reset(seed=seed)
+        return self.at_once.reset(seed=seed)
+
+    def step(self, action):
+        last = self.one_by_one.last()
+        self.one_by_one.step(None if last[2] or last[3] else action)
+        return last, self.at_once.step(dict.fromkeys(self.at_once.agents, action))
+
+
+class FleetOfAgents:
+    """A fleet under way, half of it driven by compiled policies."""
+
+    def __init__(self):
+        from parkenv.engine.fleet import DriverKind, Fleet
+        from parkenv.world.demand import Demand, Headways
+        from planners.heuristics.policies import POLICIES
+
+        drivers = DriverKind(policy=POLICIES["greedy-drive"]), DriverKind()
+        self.fleet = Fleet("mini", Demand(Headways(6)), drivers=drivers)
+
+    def reset(self, seed):
+        self.fleet.reset(seed)
+        return {}
+
+    def step(self, action):
+        car = self.fleet.next_decision()
+        seen = None if car is None else self.fleet.observation(car)
+        if car is not None:
+            self.fleet.act(action)
+        return seen or {}, self.fleet.time, self.fleet.state_names()
+
+
 def single(name="Search-v2", **options):
     return gym.make(f"parkenv/{name}", **{"scenario": "mini"} | options).unwrapped
 
@@ -103,12 +145,17 @@ KINDS = {
     "batch of occupancies": lambda: Batch(observation="occupancy", autoreset_mode=AutoresetMode.SAME_STEP),
     "local batch": lambda: Batch(observation="local"),
     "learner": Learner,
+    "cars": Cars,
+    "fleet": FleetOfAgents,
 }
 
 
 @pytest.fixture(params=KINDS)
 def kind(request):
     return KINDS[request.param]
+
+
+INNER = {"states", "envs", "one_by_one", "at_once", "fleet"}
 
 
 def run(world, actions):
@@ -124,9 +171,10 @@ def test_a_copy_goes_on_alone_as_the_original_would(kind, twin_of):
         each.reset(seed=3)
         each.step(3)
     wanted = run(plain, DRIVEN[1:3])
-    if twin_of is copy.copy and isinstance(world, (Batch, ModelState)):
-        twin, inner = copy.copy(world), "states" if isinstance(world, ModelState) else "envs"
-        setattr(twin, inner, copy.copy(getattr(world, inner)))
+    if twin_of is copy.copy and isinstance(world, (Batch, ModelState, Cars, FleetOfAgents)):
+        twin = copy.copy(world)
+        for name in INNER.intersection(vars(world)):
+            setattr(twin, name, copy.copy(getattr(world, name)))
     else:
         twin = twin_of(world)
     run(twin, (1, 1))
@@ -214,3 +262,12 @@ def test_the_belief_of_a_search_that_is_over_samples_no_search_that_goes_on(seed
         assert states.over.tolist() == [over] * 5
     assert info["parked"] == parked
     assert states.step(np.full(5, 3))[0].tolist() == [0.0] * 5
+
+
+def test_what_holds_addresses_alone_says_that_it_cannot_be_copied():
+    from planners.heuristics.policies import POLICIES
+
+    data = POLICIES["greedy-drive"].data_for([single().scenario])
+    for copied in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="holds addresses of this process"):
+            copied(data)

@@ -177,7 +177,7 @@ def test_a_single_search_takes_as_long_inside_as_agents_expect():
     assert terminated
     assert info["parked"]
     assert -reward == pytest.approx(scenario.arrival_cost_s[0])
-    assert info["reward_terms"]["drive"] == -75.0
+    assert info["reward_drive"] == -75.0
 
 
 def test_a_typical_week_fills_a_facility_as_often_as_all_of_its_spaces():

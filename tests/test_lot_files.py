@@ -427,6 +427,7 @@ def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
     assert [(p.feature, p.message) for p in problems] == [
         (9, "slot 'upstream': cannot be reached from an entry"),
         (7, "slot 'trap': no other slot can be reached from it"),
+        (None, "one-way lanes have a dead end at (80.0, 0.0) m: no lane leads on"),
     ]
 
 

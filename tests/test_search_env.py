@@ -94,7 +94,7 @@ def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
         column = int(np.flatnonzero(scenario.lot.neighbors[observation["vertex"]] >= 0)[-1])
         observation, _, terminated, truncated, info = env.step(column)
     assert not truncated
-    assert info["reward_terms"]["gave_up"] == -300.0
+    assert info["reward_gave_up"] == -300.0
     assert not info["parked"]
     assert len(seen_before_the_end & {0, 1}) == 1, "it ends as soon as the second of two slots is seen taken"
     with pytest.raises(gym.error.ResetNeeded):

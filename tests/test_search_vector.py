@@ -82,14 +82,13 @@ def assert_parity(scenarios, observation="full", n=4, steps=150, **changes):
                 continue
             alone[i], reward, *ends, metrics = env.step(actions[i])
             assert (rewards[i], terminated[i], truncated[i]) == (reward, *ends)
-            assert {name: values[i] for name, values in terms.items()} == metrics["reward_terms"]
+            assert {name: values[i] for name, values in terms.items()} == {n: metrics[n] for n in terms}
             done[i] = any(ends)
             if done[i]:
                 episodes.append(metrics["scenario_index"])
                 for name, value in metrics.items():
                     assert info[f"_{name}"][i]
-                    if name != "reward_terms":
-                        assert info[name][i] == value, name
+                    assert info[name][i] == value, name
     assert len(episodes) >= n
     return episodes
 

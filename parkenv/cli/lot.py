@@ -125,7 +125,7 @@ class Check(Command):
                 lot = read_lot(self.place)
             issues = origin.issues if origin is not None else ()
             drivability = check_drivability(lot, issues)
-            problems += drivability.problems
+            problems += [problem for problem in drivability.problems if problem not in problems]
         for problem in problems:
             feature = "" if problem.feature is None else f"feature {problem.feature}: "
             style = "red" if problem.severity == "error" else "yellow"

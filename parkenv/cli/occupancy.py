@@ -38,7 +38,7 @@ LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
 TimeZone = Annotated[str, Option(takes="NAME")]
 Capacity = Annotated[
     float | None,
-    Option(takes="PLACES"),
+    Option(takes="PLACES", default="the file's"),
     Field(gt=0, le=1e6, description="Places of the car park, for counts without such a column."),
 ]
 

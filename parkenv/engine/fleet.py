@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from array import array
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +30,7 @@ from parkenv.world.scenario import drive_times
 __all__ = ["DriverKind", "Fleet", "FleetOptions"]
 
 _UNREACHABLE_S = 1e9
+_RELEASED = -100.0  # in the course of a world, beside the times of `next_car`, and -1 - action of `act`
 
 
 class Fleet(FleetMemory):
@@ -109,11 +111,14 @@ class Fleet(FleetMemory):
         super().__init__(FleetCars(self.scenario, self.demand, options), options)
         self._agent_states: dict[int, Any] = {}  # of the agents of `run`, by car
         self._drive_s: dict[int, NDArray[np.float64]] = {}  # to all slots, by vertex
+        self._began = (0, 0)  # seed and episode
+        self._past = array("d")  # what was called since
 
     # ---- a world
 
     def reset(self, seed: int = 0, episode: int = 0) -> None:
         """Begin the world of a seed and an episode: equal numbers give equal arrivals, stays, kinds and residents."""
+        self._began, self._past = (seed, episode), array("d")
         record, key = self.record, world_key(seed, episode)
         window, occupancy = self.scenario.arrival, self.scenario.occupancy
         days = occupancy.arrival_days(window)
@@ -180,6 +185,7 @@ class Fleet(FleetMemory):
         """As `next_decision`, but return also cars whose search is over, once each; then call `release`."""
         if not len(self.cars):
             raise ResetNeeded("the fleet has no world yet: call reset() first")
+        self._past.append(until)
         while True:
             status: int = self._advance(self.address, until)
             if not self.world:
@@ -207,11 +213,14 @@ class Fleet(FleetMemory):
         Raises:
             InputError: an action that is none of the five.
         """
-        self._act(self.address, action_number(action))
+        number = action_number(action)
+        self._act(self.address, number)
+        self._past.append(-1.0 - number)
 
     def release(self) -> None:
         """Drop the car from `next_car` whose search is over; its observation is gone."""
         events.release_at(self.address)
+        self._past.append(_RELEASED)
 
     def _reserve_slots(self) -> None:
         cars = self.cars
@@ -254,6 +263,19 @@ class Fleet(FleetMemory):
         yaw = np.where(behind == ahead, lot.vertex_yaw[ahead], np.arctan2(-step[:, 1], -step[:, 0]))
         return lot.vertex_xy[ahead] + share[:, None] * step, yaw
 
-    def __reduce__(self) -> tuple[Callable[..., Fleet], tuple[Any, ...]]:
-        """Copies and pickles are fleets before their first reset: records hold addresses of this process."""
-        return Fleet, (self.scenario, self.demand, self.options)
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and pickles repeat the world from its beginning: records hold addresses of this process."""
+        made = Fleet, (self.scenario, self.demand, self.options)
+        return (*made, (self._began, self._past, dict(self._agent_states))) if len(self.cars) else made
+
+    def __setstate__(self, course: tuple[tuple[int, int], array[float], dict[int, Any]]) -> None:
+        began, past, agent_states = course
+        self.reset(*began)
+        for called in past:
+            if called == _RELEASED:
+                self.release()
+            elif called < 0.0:
+                self.act(int(-1.0 - called))
+            else:
+                self.next_car(called)
+        self._agent_states = agent_states

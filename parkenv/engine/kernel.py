@@ -85,9 +85,9 @@ def read_step(scenario_index: int, result: tuple[Any, ...]) -> tuple[float, bool
         reward, drive, failed, walk, parking, gave_up, drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s,
         driven_m, walked_m, failed_parks, slots_passed, parked, over, vertex,
     ) = result  # fmt: skip
-    terms = {"drive": drive, "failed": failed, "walk": walk, "parking": parking, "gave_up": gave_up}
     info = {
-        "reward_terms": terms, "drive_s": drive_s, "failed_s": failed_s, "walk_s": walk_s,
+        "reward_drive": drive, "reward_failed": failed, "reward_walk": walk, "reward_parking": parking,
+        "reward_gave_up": gave_up, "drive_s": drive_s, "failed_s": failed_s, "walk_s": walk_s,
         "parking_cost_s": parking_cost_s, "gave_up_s": gave_up_s, "total_s": total_s, "driven_m": driven_m,
         "walked_m": walked_m, "failed_parks": failed_parks, "slots_passed": slots_passed, "parked": parked,
         "scenario_index": scenario_index,

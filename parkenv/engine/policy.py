@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,9 @@ class PolicyData:
         for name, array in arrays.items():
             self.record[name] = address_of(array, array.dtype)
         self.address = address_of(self.record, dtype)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("PolicyData holds addresses of this process: copy the CompiledPolicy, or the Fleet")
 
 
 @dataclass(frozen=True, eq=False)

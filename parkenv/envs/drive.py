@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 SUBSTEPS = 2  # physics steps per action
 CONTROL_S = SUBSTEPS * PHYSICS_S  # control period, s
 CONTACT_COST = 200.0  # default cost of a contact, s: more than any drive within the step limit
-REWARD_TERMS = ("time", "approach", "contact")
+REWARD_TERMS = ("reward_time", "reward_approach", "reward_contact")
 LEFT_AREA = "left the area"
 CONTACTS = ("", *(kind.label for kind in ObstacleKind if kind), LEFT_AREA)
 """What `info["contact"]` numbers."""
@@ -105,8 +105,8 @@ length and width over the car's |
     - `sparse`: -0.1 per step, its duration in seconds; 0 for the step that parks.
     - `dense`: in addition -0.1 s × (distance to the goal / 10 m + angle to it / π).
 
-    A contact costs `contact_cost`, s. `info["reward_terms"]` holds the terms `time`, `approach` and `contact`, which
-    add up to the reward. `compute_reward(achieved_goal, desired_goal, info)` returns the same for batches of goals,
+    A contact costs `contact_cost`, s. `info` holds the parts of the reward, `reward_time`, `reward_approach` and
+    `reward_contact`. `compute_reward(achieved_goal, desired_goal, info)` returns the same for batches of goals,
     with the contact from `info["contact"]`.
 
     ## Starting State
@@ -126,7 +126,7 @@ length and width over the car's |
 
     ## Info
     Numbers under the same keys after reset and step: `time_s`, `driven_m`, `direction_changes`, `position_error_m`,
-    `angle_error_rad`, `contact` (0 without one), `is_success`, `parked` and `reward_terms`.
+    `angle_error_rad`, `contact` (0 without one), `is_success`, `parked` and the parts of the reward.
     Hindsight relabelling needs the contact: `HerReplayBuffer(..., copy_info_dict=True)` in stable-baselines3.
 
     ## Arguments
@@ -150,7 +150,7 @@ length and width over the car's |
     >>> observation["achieved_goal"].shape
     (7,)
     >>> observation, reward, terminated, truncated, info = env.step(np.array([1.0, 0.0], dtype=np.float32))
-    >>> bool(np.isclose(reward, sum(info["reward_terms"].values())))
+    >>> bool(np.isclose(reward, sum(info[name] for name in info if name.startswith("reward_"))))
     True
 
     ```
@@ -424,7 +424,7 @@ length and width over the car's |
 
     def _info(self, state: DriveState, terms: Sequence[float]) -> dict[str, Any]:
         return {
-            "reward_terms": dict(zip(REWARD_TERMS, terms, strict=True)),
+            **dict(zip(REWARD_TERMS, terms, strict=True)),
             "is_success": state.parked,
             "contact": CONTACTS.index(state.contact),
             "time_s": state.time,

@@ -34,6 +34,7 @@ from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout, action
 from parkenv.engine.state import SearchState
 from parkenv.errors import InputError, require, require_number, require_one_of, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
+from parkenv.world.cost_terms import REWARD_TERMS
 from parkenv.world.lot import ACTIONS
 from parkenv.world.occupancy.process import raise_error
 from parkenv.world.scenario import Scenario
@@ -116,8 +117,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ## Rewards
     Minus the duration of the step, s. Parking also subtracts the walk to the goal and the slot's parking cost
     (`ParkingLot.slot_parking_cost_s`, 0 by default), so the return is minus the total time to the goal.
-    `info["reward_terms"]` holds the terms `drive` (moving or waiting), `failed` (failed attempts), `walk`, `parking`
-    (the slot's cost) and `gave_up`; they add up to the reward.
+    `info` holds its parts, which add up: `reward_drive` (moving or waiting), `reward_failed` (failed attempts),
+    `reward_walk`, `reward_parking` (the slot's cost) and `reward_gave_up`.
 
     ## Starting state
     The car is at the scenario's entry, at a time drawn from its arrival window. The first observation holds only the
@@ -138,8 +139,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     `info` holds numbers under the same keys after reset and step: the episode's metrics so far, drive_s, failed_s,
     walk_s, parking_cost_s, gave_up_s, total_s, driven_m, walked_m, failed_parks, slots_passed (slots whose vertex the
-    car stopped at) and parked; scenario_index; and reward_terms. The step count of a time-limit wrapper is not part of
-    `get_state`.
+    car stopped at) and parked; scenario_index; and the parts of the reward. The step count of a time-limit wrapper is
+    not part of `get_state`.
 
     ## Several scenarios
     With several scenarios, each episode is in one of them, drawn from the seed and the number of the episode: the same
@@ -171,7 +172,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
       of `local` and `action_mask` that describes the car's surroundings, see `parkenv.engine.local_observation`.
     - `k`: number of slots that `local` describes, 5 if None.
     - `flat`: whether the observation is one vector, see `parkenv.engine.spaces.FlatLayout`; not with `full`.
-    - `reward_scale`: factor of the rewards and of `reward_terms`; times and metrics in `info` remain in seconds.
+    - `reward_scale`: factor of the rewards and their parts; times and metrics in `info` remain in seconds.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`; unknown ones raise a TypeError.
 
     ```python
@@ -183,7 +184,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     >>> observation["p_occupied"].shape, env.action_space.n
     ((10,), np.int64(5))
     >>> observation, reward, terminated, truncated, info = env.step(3)
-    >>> bool(np.isclose(reward, sum(info["reward_terms"].values())))
+    >>> bool(np.isclose(reward, sum(info[name] for name in info if name.startswith("reward_"))))
     True
 
     ```
@@ -345,7 +346,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._over = over
         if self.reward_scale != 1.0:
             reward *= self.reward_scale
-            info["reward_terms"] = {n: term * self.reward_scale for n, term in info["reward_terms"].items()}
+            info |= {name: info[name] * self.reward_scale for name in REWARD_TERMS}
         if self.render_mode == "human":
             self.render()
         return self._observation(vertex), reward, over, False, info

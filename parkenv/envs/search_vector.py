@@ -43,8 +43,7 @@ if TYPE_CHECKING:
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
 # Gymnasium's names of the masks that say which searches have a metric.
-_WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "scenario_index"))
-_WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
+_WHICH = tuple(f"_{name}" for name in (*REWARD_TERMS, *METRICS, "scenario_index"))
 # Types and places of the metrics and the step's terms in a SEARCH record.
 _PLACES = [dict(SEARCH.fields or {})[name][:2] for name in (*METRICS, *STEP_FIELDS)]
 _OFFSETS = np.array([offset for _, offset in _PLACES])
@@ -69,7 +68,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
       cost are the same on every lot.
 
     ## Rewards
-    As in `parkenv/Search-v2`, float64. `reward_terms` holds the last step's terms.
+    As in `parkenv/Search-v2`, float64. `reward_terms` holds the parts of the last step's.
 
     ## Starting state
     As in `parkenv/Search-v2`. `reset(seed=s)` gives search i the seed s + i; a sequence gives one seed to each.
@@ -407,8 +406,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         views = [words.view(dtype)[:, :: 8 // dtype.itemsize] for dtype in _TYPES]
         metrics: dict[str, Any] = {name: views[dtype][i] for i, (name, dtype) in enumerate(_METRIC_TYPES)}
         costs = words[len(METRICS) :].view(np.float64)
-        terms = zip(REWARD_TERMS, np.multiply(costs, -self.reward_scale, out=costs), strict=True)
-        metrics["reward_terms"] = dict(terms) | dict.fromkeys(_WHICH_TERMS, done)
+        metrics |= zip(REWARD_TERMS, np.multiply(costs, -self.reward_scale, out=costs), strict=True)
         metrics["scenario_index"] = self.scenario_index
         return metrics | dict.fromkeys(_WHICH, done)
 

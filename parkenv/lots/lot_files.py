@@ -254,7 +254,7 @@ def check_lot(path: str | Path) -> list[LotProblem]:
 
     A file with errors cannot be read. Warnings are about usable lots with probable mistakes: goals far from all lanes;
     lanes that cross or nearly touch without a common point; slots that overlap, face away from their lane, cannot be
-    reached from an entry or do not lead to another slot; entries that do not lead to a slot.
+    reached from an entry or do not lead to another slot; entries that do not lead to a slot; dead ends.
 
     For OpenStreetMap files and lists of slots, errors state what a search still needs, and warnings what an import
     leaves out.
@@ -274,6 +274,7 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     if not any(problem.severity == "error" for problem in problems):
         lot = ParkingLot(**contents.columns())
         problems += _reach_warnings(lot, contents.numbers["slot"], contents.numbers["entry"])
+        problems += (LotProblem("warning", None, text) for text in dead_ends(lot))
     return problems
 
 
@@ -369,6 +370,20 @@ def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tupl
                     "cars cannot turn there"
                 ),
             )
+
+
+def dead_ends(lot: ParkingLot) -> list[str]:
+    """Name places from which no lane leads on, or none to a slot, although cars get there."""
+    graph = lot.drive_matrix()
+    to_slot = np.isfinite(dijkstra(graph.T.tocsr(), indices=np.arange(lot.n_slots), min_only=True))
+    reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
+    exits = np.diff(graph.tocsr().indptr) == 0
+    texts = []
+    for vertex in np.flatnonzero(reached & (exits | ~to_slot)).tolist():
+        x, y = lot.vertex_xy[vertex]
+        what = "no lane leads on" if exits[vertex] else "no slot can be reached any more"
+        texts.append(f"one-way lanes have a dead end at ({x:.1f}, {y:.1f}) m: {what}")
+    return texts
 
 
 def _reach_warnings(

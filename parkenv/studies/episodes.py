@@ -16,7 +16,7 @@ from parkenv.engine.state import SearchState
 from parkenv.mapping.trips import Trip
 from parkenv.studies.results import DECISIONS, Row, timed_row
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
-from parkenv.world.cost_terms import METRICS
+from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent
 from planners.bounds.oracle import best_slot
@@ -114,7 +114,7 @@ class EpisodeRunner:
         metrics = {
             name: value
             for name, value in result.info.items()
-            if name not in ("reward_terms", "scenario", "scenario_index")
+            if name not in (*REWARD_TERMS, "scenario", "scenario_index")
         }
         state, scenario = self._state, self.scenario
         return SearchRecord(

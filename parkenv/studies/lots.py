@@ -24,6 +24,7 @@ from parkenv.lots.draft import (
 )
 from parkenv.lots.formats.contents import LotProblem
 from parkenv.lots.generators import nearest_on_lanes
+from parkenv.lots.lot_files import dead_ends
 from parkenv.lots.osm.draft import import_car_parks
 from parkenv.show.figures.lots import save_census, save_contact_sheets
 from parkenv.show.plurals import plural
@@ -50,7 +51,7 @@ class Drivability:
 def check_drivability(lot: ParkingLot, issues: tuple[QualityIssue, ...] = ()) -> Drivability:
     problems = tuple(
         LotProblem("warning", None, text)
-        for text in (*_open_loops(lot), *_dead_ends(lot), *_blocked_lanes(lot))
+        for text in (*_open_loops(lot), *dead_ends(lot), *_blocked_lanes(lot))
     )
     if problems:
         issues = (*issues, QualityIssue("lanes that are blocked or lead nowhere", 0.5))
@@ -64,20 +65,6 @@ def _open_loops(lot: ParkingLot) -> list[str]:
     slots = f"{len(apart)} slots ({names}{', ...' if len(apart) > NAMED else ''})"
     text = f"one-way lanes form no loop: a car that passed {slots} does not get back to the others"
     return [text] if len(apart) else []
-
-
-def _dead_ends(lot: ParkingLot) -> list[str]:
-    """Name places from which no lane leads on, or none to a slot, although cars get there."""
-    graph = lot.drive_matrix()
-    to_slot = np.isfinite(dijkstra(graph.T.tocsr(), indices=np.arange(lot.n_slots), min_only=True))
-    reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
-    exits = np.diff(graph.tocsr().indptr) == 0
-    texts = []
-    for vertex in np.flatnonzero(reached & (exits | ~to_slot)).tolist():
-        x, y = lot.vertex_xy[vertex]
-        what = "no lane leads on" if exits[vertex] else "no slot can be reached any more"
-        texts.append(f"one-way lanes have a dead end at ({x:.1f}, {y:.1f}) m: {what}")
-    return texts
 
 
 def _blocked_lanes(lot: ParkingLot) -> list[str]:

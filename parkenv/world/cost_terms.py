@@ -13,7 +13,7 @@ from typing import NamedTuple
 class CostTerm(NamedTuple):
     """A part of the total time."""
 
-    name: str  # key in `info["reward_terms"]`, where it is negative
+    name: str  # with `reward_` before it, key of a step's part of the reward in `info`, where it is negative
     field: str  # key of its sum over an episode, s, in `info`, and name of its column in tables and records
     label: str  # name for people
     help: str  # explanation
@@ -38,8 +38,8 @@ COST_TERMS = (
 )  # fmt: skip
 """All terms, in the order in which they are added up."""
 
-REWARD_TERMS = tuple(term.name for term in COST_TERMS)
-"""Keys of `info["reward_terms"]`."""
+REWARD_TERMS = tuple(f"reward_{term.name}" for term in COST_TERMS)
+"""Keys of the parts of a step's reward in `info`; they add up to it."""
 COST_FIELDS = tuple(term.field for term in COST_TERMS)
 """Keys of the sums over an episode; they add up to `total_s`."""
 METRICS = (*COST_FIELDS, "total_s", "driven_m", "walked_m", "failed_parks", "slots_passed", "parked")
