@@ -1,4 +1,7 @@
-"""The first search: drive a car by the thesis's planner, and watch what it costs."""
+"""The first search: drive a car by the thesis's planner, and watch what it costs.
+
+It takes a few seconds.
+"""
 
 import gymnasium as gym
 

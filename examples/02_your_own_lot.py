@@ -1,4 +1,7 @@
-"""A lot of your own: describe it in metres, save it as GeoJSON, and search there."""
+"""A lot of your own: describe it in metres, save it as GeoJSON, and search there.
+
+It takes a few seconds.
+"""
 
 import tempfile
 from pathlib import Path

@@ -1,7 +1,7 @@
 """How bold should the planner be? Vary what it believes a failed attempt to cost, in the same worlds.
 
 The world charges 10 s all along. `parkenv compare --failure-cost sweep` varies both: what the world charges, and with
-it what planners believe. Rows come at the end.
+it what planners believe. Rows come at the end, after some seconds.
 """
 
 import parkenv

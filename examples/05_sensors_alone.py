@@ -1,4 +1,7 @@
-"""The simulated sensors without a parking lot: three cars, a wall, a camera and a laser."""
+"""The simulated sensors without a parking lot: three cars, a wall, a camera and a laser.
+
+It takes a few seconds.
+"""
 
 from pathlib import Path
 

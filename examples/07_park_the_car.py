@@ -1,4 +1,7 @@
-"""From the slot graph to the steering wheel: a planner parks a car of real size among others, in pymunk."""
+"""From the slot graph to the steering wheel: a planner parks a car of real size among others, in pymunk.
+
+It takes a few seconds, with a line for each drive.
+"""
 
 import gymnasium as gym
 

@@ -2,7 +2,7 @@
 
 A lot of one's own, surveyed through simulated sensors on three days; then agents search there on new days: with the
 map, and with a map that says of every slot that half of the time it is taken. All meet the same cars.
-A line says when the survey begins, and when the searches do.
+It takes about half a minute; a line says when the survey begins, and when the searches do.
 """
 
 import tempfile

@@ -1,4 +1,7 @@
-"""Many cars in one lot: three kinds of drivers compete for slots; a table, and a film from above."""
+"""Many cars in one lot: three kinds of drivers compete for slots; a table, and a film from above.
+
+It takes a few seconds.
+"""
 
 import sys
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Many cars with SuperSuit: the parallel form of the lot as a vector environment of stable-baselines3.
 
+It takes about a quarter of a minute.
+
 SuperSuit wants a fixed number of agents with plain boxes as observations. So each car observes the probability that
 each slot is taken, its actions, and where it is; a car that has parked stays on and observes zeros ("black death").
 Without the packages of the extra `marl`, the example says so.

@@ -1,5 +1,7 @@
 """Searches of some agents as a data set for offline reinforcement learning, in Minari's format.
 
+It takes a few seconds.
+
 `python examples/record_minari.py` records a few searches in `minari_data` (`pip install "minari[hdf5]"`). Agents take
 turns; at random, some of their actions are replaced by any that is possible. The data set holds what they observed,
 did and paid, and with which probability each action was drawn, as off-policy evaluation needs it.

@@ -1,5 +1,7 @@
 """Prices that follow demand: San Francisco's rule of SFpark, round after round, in a made town with many cars.
 
+It takes some minutes, with a line after each round.
+
     python examples/sfpark_prices.py
 
 After each round the price of an hour in a zone changes by what its occupancy was: above 80 % it rises by a step, from
@@ -23,7 +25,7 @@ def changed(price, occupancy):
 
 
 prices, columns, cars = {}, {zone: [] for zone in ZONES}, []
-for _ in range(ROUNDS):
+for number in range(ROUNDS):
     # Without a price of its own, as in the first round, a zone has that of the town's file.
     zones = {zone: {"price": price} for zone, price in prices.items()}
     town = {"base": "town", "arrivals": {"hours": HOURS}, "zones": zones}
@@ -34,6 +36,7 @@ for _ in range(ROUNDS):
             columns[row["zone"]].append(f"{row['price']:.2f} {row['occupancy']:4.0%}")
             prices[row["zone"]] = changed(row["price"], row["occupancy"])
     cars.append(result.rows[0])
+    print(f"round {number + 1} of {ROUNDS}: {cars[-1]['total_s']:.0f} s a car", flush=True)
 
 print("price of an hour and share of the spaces taken, by round")
 for zone, cells in columns.items():

@@ -13,7 +13,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 import parkenv  # noqa: F401  registers the environments
 from planners.driving.parking import ParkingAgent
 
-DECISIONS, TASKS = 20_000, 50
+DECISIONS, ROUNDS, TASKS = 20_000, 10, 50
 TASK = {
     "lot": "campus",
     "kinds": ("perpendicular",),
@@ -76,7 +76,9 @@ model = SAC(
     seed=0,
     device="cpu",
 )
-model.learn(DECISIONS)
+for number in range(ROUNDS):
+    model.learn(DECISIONS // ROUNDS, reset_num_timesteps=False)
+    print(f"{number + 1} of {ROUNDS} parts learned", flush=True)
 model.save("drive.zip")
 print(f"{DECISIONS:,} decisions: parks in {success(env, model):.0%} of {TASKS} held-out tasks")
 with_map = gym.make("parkenv/Drive-v1", **TASK, obstacle_map=True)

@@ -1,5 +1,7 @@
 """Train weights for the agent `network`: clone the choices of `belief`, and compare both in held-out worlds.
 
+It takes about a minute, with a line after each round.
+
 `python examples/train_network.py` trains on two packaged lots. The packaged weights learned from 10,000 decisions on
 dozens of made lots, in the same two rounds: first the teacher drives, then the network, while the teacher labels what
 it meets (DAgger). Two things that they had are left out here: the values of the teacher's other actions as labels, and

@@ -206,3 +206,11 @@ def test_pages_are_short():
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert len(changes.split()) <= 900
     assert len(changes.splitlines()) <= 60
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
+def test_an_example_says_how_long_it_takes(path):
+    """Those that are no scripts, or take as long as they are told, say nothing."""
+    if path.stem not in ("ground_detector", "pomdp_py_agents", "shorten_drives"):
+        said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+        assert re.search(r"\b(seconds|minutes?)\b", said), f"{path}: says not how long it takes"

@@ -358,7 +358,12 @@ def test_fees_stays_and_access_become_rules(tags, rules):
             ("2 EUR / 30 min", Charge(4.0)),
         ),
         *(("1.200,50 IDR/h", Charge(1200.5)), ("1'000 CLP/h", Charge(1000.0)), ("\u20ac2/h", Charge(2.0))),
-        *(("free", Charge(0.0)), ("2 EUR", None), ("2000 EUR/h", None), ("1.250 EUR/h", Charge(1.25))),
+        *(
+            ("free", Charge(0.0)),
+            ("2 EUR", None),
+            ("2000 EUR/h", None),
+            ("1.250 EUR/h", Charge(1.25, doubt="1.25, not thousands")),
+        ),
     ],
 )
 def test_charges_are_read_with_their_separators(text, charge):
@@ -457,6 +462,30 @@ def test_what_cannot_be_read_is_listed(tmp_path):
     disabled = next(f for f in town.draft.facilities if f.name == "P3, disabled")
     assert disabled.capacity == 30
     assert town.draft.zone_rules[disabled.zone].users == ("disabled",)
+
+
+def test_keys_of_rules_that_nobody_reads_are_listed(tmp_path):
+    other = {"parking:left:times": "Mo-Fr", "parking:lane:both:conditional": "no @ (We)"}
+    read = {"parking:right:maxstay:conditional": "1 h @ (Mo-Fr)", "parking:left:orientation": "diagonal"}
+    car_park = {"capacity:hgv": "4", "access:times": "Mo", "opening_hours:covid19": "off", "charge:rate": "2"}
+    known = {"capacity": "9", "capacity:disabled": "1", "access": "yes", "maxstay:conditional": "1 h @ (Mo)"}
+    place = grid(**{"parking:both": "lane"}, **other, **read, surface="asphalt")
+    town = draft(
+        place.box(20, 20, 60, 50, {"amenity": "parking", **car_park, **known, "fee:note": "x"}), tmp_path
+    )
+    assert {row.tag for row in town.draft.unread if row.assumed == "as without it"} == {*other, *car_park}
+
+
+def test_a_map_of_streets_alone_has_its_goals_along_them(tmp_path):
+    place = Map()
+    for k in (0, 90):
+        place.way([(0, k), (300, k)], STREET, **{"parking:both": "lane"})
+        place.way([(k, 0), (k, 300)], STREET)
+    town = draft(place, tmp_path)
+    lot = town.draft.lot()
+    assert "goals along the streets" in town.draft.guesses[-1]
+    assert len(lot.goals) > 5
+    assert max(lot.goals.max(axis=0)) <= 301.0
 
 
 def test_goals_weigh_by_what_stands_there(tmp_path):

@@ -1,7 +1,10 @@
 """`parkenv/SearchSensors-v2`: raw observations of the same searches, and what else moves in the lot."""
 
 import copy
+import os
 import pickle
+import subprocess
+import sys
 
 import gymnasium as gym
 import numba
@@ -334,3 +337,38 @@ def test_cars_of_a_full_lot_do_not_touch(name):
         assert len(scene.present) == lot.n_slots
         cars = STRtree([Polygon(scene.footprint(i)) for i in scene.present])
         assert cars.query(cars.geometries, predicate="intersects").shape[1] == lot.n_slots
+
+
+IN_THREADS_AND_FORKS = """
+import gymnasium as gym
+import numpy as np
+import parkenv
+env = gym.make("parkenv/SearchPerception-v2", scenario="mini", picture_width=100)
+env.reset(seed=0)
+for action in (0, 3, 1, 2):
+    env.step(action)
+envs = gym.make_vec("parkenv/SearchSensors-v2", 2, "async", scenario="mini", vector_kwargs={"context": "fork"})
+envs.reset(seed=0)
+envs.step(np.array([3, 3]))
+envs.close()
+print("done")
+"""
+
+
+def test_sensors_work_without_openmp_and_in_forks_after_a_step():
+    """Numba's own threads are neither safe in several threads of ours, nor after a fork."""
+    environment = os.environ | {"NUMBA_THREADING_LAYER": "workqueue"}
+    command = [sys.executable, "-c", IN_THREADS_AND_FORKS]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr
+
+
+def test_an_environment_is_copied_while_its_window_is_open(monkeypatch):
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gym.make("parkenv/Search-v2", scenario="mini", render_mode="human").unwrapped
+    env.reset(seed=0)
+    twin = copy.deepcopy(env)
+    assert data_equivalence(env.step(3), twin.step(3))
+    env.close()
+    twin.close()

@@ -6,7 +6,9 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import fields
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Annotated, Self
 
 import numpy as np
@@ -23,6 +25,7 @@ from parkenv.files.folder_lock import only_writer
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import Several, require_together
+from parkenv.lots.unread import Unread
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.world.tariff import NO_ZONE
@@ -46,13 +49,7 @@ _LOT_COLUMNS = (
     Column("result", "result"),
     Column("reason", "reason"),
 )
-_UNREAD_COLUMNS = (
-    Column("tag", "tag"),
-    Column("value", "value"),
-    Column("count", "how often", digits=0),
-    Column("assumed", "assumed"),
-)
-_MOST_UNREAD = 40  # most rows of what could not be read that are printed
+_MOST_UNREAD = 20  # most rows of what could not be read that are printed
 AUTO = "auto"  # value of `--entry` and `--goal` that allows a guess
 LotName = Annotated[
     str,
@@ -339,10 +336,13 @@ class Import(Command):
             write_csv(table, TABLE, town.facilities)
             console.print(f"Facilities: {table}")
         if draft.unread or unread_csv.exists():
-            rows = [vars(row) for row in draft.unread]
-            write_csv(unread_csv, [column.key for column in _UNREAD_COLUMNS], rows)
-            print_rows(console, "Tags that could not be read", rows[:_MOST_UNREAD], columns=_UNREAD_COLUMNS)
-            console.print(f"Tags that could not be read: {len(rows)}, all in {unread_csv}")
+            write_csv(unread_csv, [field.name for field in fields(Unread)], map(vars, draft.unread))
+            console.print(
+                f"Tags that could not be read, and what was assumed: {len(draft.unread)}, all in {unread_csv}"
+            )
+            for row in sorted(draft.unread, key=lambda row: -row.count)[:_MOST_UNREAD]:
+                text = shorten(f"{row.tag}={row.value}", 60, placeholder="...")
+                console.print(f"{row.count:5} {text}: {row.assumed}", highlight=False, markup=False)
         console.print(f"Wrote {self.out}. {_summary(lot)}")
         if caution:
             console.print(caution, style="yellow")

@@ -267,6 +267,35 @@ def note_users(tags: Tags, key: str, layer: Conditional) -> Conditional:
     return layer
 
 
+_SIDE = "(?:left|right|both)"
+_VEHICLES = "(?:access|motorcar|motor_vehicle|vehicle)"
+_RULES = f"(?:fee|charge|maxstay|{_VEHICLES})(?::conditional)?"
+_READ = re.compile(
+    rf"{_RULES}|opening_hours|capacity(?::(?:{'|'.join(RESERVED_PLACES)}))?"
+    rf"|parking:{_SIDE}:(?:{_RULES}|restriction(?::conditional)?|capacity)"
+    rf"|parking:lane:{_SIDE}(?::capacity)?|parking:condition:{_SIDE}:(?:default|maxstay|conditional)"
+    rf"|parking:condition:(?:[23]:)?{_SIDE}(?::[23])?(?::(?:time_interval|vehicles))?|parking:ticket:zone"
+)
+_ON_RULES = re.compile(
+    r"(?:parking:(?:.*:)?)?(?:fee|charge|maxstay|access|motorcar|motor_vehicle|vehicle|opening_hours|capacity|restriction"
+    r"|conditions?|times?|hours|disc)(?::.*)?|parking:.*:conditional"
+)
+_NO_RULE = re.compile(
+    r".*:(?:capacity:free|reason|residents|private|except|note|source|authentication)(?::.*)?"
+)
+
+
+def note_other_keys(tags: Tags) -> None:
+    """List keys of rules of parking that nothing here reads."""
+    for key in tags:
+        if (
+            key[:1] in "pfcmavo"
+            and _ON_RULES.fullmatch(key)
+            and not (_READ.fullmatch(key) or _NO_RULE.fullmatch(key))
+        ):
+            note_unread(tags, key, "as without it")
+
+
 def access_layer(tags: Tags, prefix: str = "") -> Conditional:
     """Return the values of the most specific access tag: whom a place is for."""
     key = prefix + (decisive_access(tags, prefix) or "access")
@@ -346,6 +375,8 @@ def charge_in(text: str) -> Charge | None:
         seconds = float((match["n"] or "1").replace(",", ".")) * _seconds(match["unit"])
         is_small = SMALL.search(f"{match['before'] or ''} {match['after']}") is not None
         amount = _amount(match["amount"], is_small)
+        if is_small and re.fullmatch(r"[1-9]\d{0,2}[.,]\d{3}", match["amount"]):
+            doubt = f"{amount:g}, not thousands"
         if not seconds or seconds > DAY_S or (is_small and amount * HOUR_S / seconds > MOST_PER_HOUR):
             doubt = "without the other prices"
             continue

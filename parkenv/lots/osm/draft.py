@@ -37,7 +37,7 @@ from parkenv.lots.infer.layout import draft_inferred_lot, infer_lot
 from parkenv.lots.infer.network import STREET, Line, limit_junctions
 from parkenv.lots.infer.spaces import rectangle_corners, spaces_from_outlines, to_rectangle, validate_areas
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.conditions import RESERVED_PLACES
+from parkenv.lots.osm.conditions import RESERVED_PLACES, note_other_keys
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.parking import (
     ARRANGEMENTS,
@@ -250,6 +250,7 @@ class _LotImport(MapImport):
             if reason is not None:
                 self.left_out[f"parking areas with {reason}"].append(name)
                 continue
+            note_other_keys(tags)
             if shapely.contains(area.polygon, centers).any():
                 continue
             orientation = tags.get("orientation", tags.get("parking:orientation"))
@@ -297,6 +298,7 @@ class _LotImport(MapImport):
                     self.left_out[kerb].append(f"{road.id}-{tagged}")
                 if kerb is None or isinstance(kerb, str):
                     continue
+                note_other_keys(road.tags)
                 slots = kerb_slots(road, side, kerb, junctions.closed_intervals(k, side))
                 slots = slots[~shapely.intersects(corridors, slots.boxes(shrink=0.05))]
                 self._add_row(KERBSIDE, road.id, f"{road.id}-{tagged}", slots, road.rank)

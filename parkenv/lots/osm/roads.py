@@ -226,11 +226,12 @@ def _parts_between(
     near: Any = at.query_ball_point(road.points, NODE_TOLERANCE)
     for i, each in enumerate(near):
         for tags, name in ((barriers[k].tags, barriers[k].id) for k in each):
-            passes = road.rank is not Rank.STREET and _assumed_open(tags)
-            stops[i] |= not passes
+            if road.rank is not Rank.STREET and _assumed_open(tags):
+                note_unread(tags, "barrier", "open to cars on a service road")
+                continue
+            stops[i] = True
             what = f"barrier={tags['barrier']}" if "barrier" in tags else str(closed_to_cars(tags))
-            reason = f"{what} on service roads, taken for open" if passes else f"roads through {what}"
-            met.setdefault(reason, {})[name] = None
+            met.setdefault(f"roads through {what}", {})[name] = None
     last = len(stops) - 1
     cuts = [i for i, stop in enumerate(stops) if stop or i in (0, last)]
     parts = []

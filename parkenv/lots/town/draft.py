@@ -30,7 +30,7 @@ from parkenv.files.file_names import is_plain
 from parkenv.lots.draft import LeftOut, LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots, nearest_on_lanes
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.conditions import RESERVED_PLACES, closed_parking
+from parkenv.lots.osm.conditions import RESERVED_PLACES, closed_parking, note_other_keys
 from parkenv.lots.osm.draft import (
     MAPPED_OVERLAP,
     NO_AISLE,
@@ -85,6 +85,7 @@ PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
 NO_ENTRY = "no entry: no street crosses the edge of the map"
 TOO_FAR = f"parking farther than {FACILITY_REACH:g} m from every street"
 NO_GOAL = "no goal: no building and no point of interest in it; export buildings and shops, too"
+ALONG_STREETS = "goals along the streets, as there is no building and no point of interest; export these, too"
 UNUSED = ("construction", "disused", "abandoned")  # values of `parking` that no car may use
 
 
@@ -292,6 +293,7 @@ class _TownImport(MapImport):
             rule = rule_of(tags)
             kind = "garage" if rule in GARAGES else "lot"
             rules = rules_of(tags)
+            note_other_keys(tags)
             if rule == "boxes" and rules.users == PUBLIC:
                 rules = replace(rules, users="private")
             xy = self._entrance(shape, entrances if kind == "garage" else [])
@@ -390,6 +392,9 @@ class _TownImport(MapImport):
         goals, weights = weighted_goals(
             self.place.elements, self.buildings, self.frame, self.tree, self.beside
         )
+        along = self.beside is None and not len(goals)
+        if along:
+            goals, weights = goals_along(self.lines)
         draft = LotDraft(
             name=self.name,
             slot_ids=tuple(ids),
@@ -420,8 +425,8 @@ class _TownImport(MapImport):
             *turns.left_out,
             *draft.left_out,
         )
-        found = (*_findings(self, rows, draft), *turns.found, *self.place.cut_elements())
-        guesses = tuple(_guesses(rows, draft))
+        found = (*_findings(self, rows, draft, along), *turns.found, *self.place.cut_elements())
+        guesses = (*_guesses(rows, draft), *((ALONG_STREETS,) if along else ()))
         return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows)
 
 
@@ -472,7 +477,9 @@ def _unseen_garages(
         yield replace(group[0], tags={"parking": usual, **tags, "amenity": "parking"})
 
 
-def _findings(town: _TownImport, rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
+def _findings(
+    town: _TownImport, rows: Sequence[dict[str, Any]], draft: LotDraft, along: bool
+) -> Iterator[str]:
     length, kept, real = town.streets.length, town.streets.kept, ~town.streets.is_beyond
     connected = length[kept & real].sum() / length[real].sum()
     yield f"streets: {length.sum() / 1e3:.0f} km, {connected:.1%} of them connected; lanes: {len(draft.lanes)}"
@@ -484,7 +491,7 @@ def _findings(town: _TownImport, rows: Sequence[dict[str, Any]], draft: LotDraft
         listed = ", ".join(f"{source}: {n:,}" for source, n in places.items() if n)
         yield f"{kind}s: {len(of_kind):,}, places: {sum(places.values()):,} ({listed or 'none'})"
     yield f"entries: {len(draft.entries)}, where streets cross the edge of the map"
-    yield f"goals: {len(draft.goals)}, of buildings and points of interest"
+    yield f"goals: {len(draft.goals)}, of {'streets' if along else 'buildings and points of interest'}"
     yield f"zones: {', '.join(draft.zone_rules)}"
     yield from (f"of the list: {line}" for line in town.listed)
     yield f"frame: {town.frame}"
@@ -572,6 +579,16 @@ def weighted_goals(
     xy, weight = xy[near], weight[near]
     if not len(xy):
         return np.empty((0, 2)), {}
+    return _clustered(xy, weight)
+
+
+def goals_along(streets: Any) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return goals of all purposes along streets, (n,) LineStrings, where nothing else is mapped."""
+    xy = shapely.get_coordinates(shapely.segmentize(streets, APART))
+    return _clustered(xy, np.ones((len(xy), len(PURPOSES))))
+
+
+def _clustered(xy: FloatArray, weight: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
     # Every purpose counts alike where goals lie, however large its numbers are.
     share = (weight / np.maximum(weight.sum(axis=0), 1e-9)).sum(axis=1)
     used = share > 0.0

@@ -40,6 +40,7 @@ from parkenv.lots.osm.conditions import (
     conditional,
     duration,
     hours_text,
+    note_other_keys,
     opening,
     parking_users,
     week_of,
@@ -466,6 +467,7 @@ def kerb_sides(
                     left_out[kerb].append(f"{road.id}-{tagged}")
                 if kerb is None or isinstance(kerb, str):
                     continue
+                note_other_keys(road.tags)
                 capacity, source, rule = kerb.capacity, "tag", ""
                 if capacity is None:
                     free = sum(end - start for start, end in free_intervals(total, closed))
