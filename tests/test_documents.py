@@ -1,5 +1,6 @@
 """Commands, code and numbers in README, documentation and contributing guide are correct; examples run."""
 
+import ast
 import importlib.util
 import re
 import shlex
@@ -106,7 +107,7 @@ FEWER = {
     r"(STEPS, BATCH, RATE =) 3_000, 8": r"\1 4, 2",
     r"range\(1, 31\)": "range(1, 11)",
     r"(ROUNDS, DAYS, HOURS) = .*": r"\1 = 2, 1, '10:00-10:30'",
-    r"DECISIONS, TASKS = 20_000, 50": "DECISIONS, TASKS = 1_100, 2",
+    r"DECISIONS, ROUNDS, TASKS = 20_000, 10, 50": "DECISIONS, ROUNDS, TASKS = 1_100, 1, 2",
     r"(DECISIONS, EPOCHS, BATCH) = 2_000, 8": r"\1 = 50, 2",
     r"WORLDS = 40": "WORLDS = 2",
     r"SCENES, DEADLINE_S = 10, 3.0": "SCENES, DEADLINE_S = 1, 1.0",
