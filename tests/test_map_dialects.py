@@ -192,7 +192,7 @@ def test_viaducts_do_not_meet_the_street_below(tmp_path, layer, joined):
     place = (
         Map().way([(0, 0), (100, 0), (200, 0)], STREET).way([(0, 0), (0, 90), (200, 90), (200, 0)], STREET)
     )
-    place.way([(100.0, 90.0), (100.0, 1e-5), (100, -90), (0, -90), (0, 0)], STREET, **layer)
+    place.way([(100.0, 90), (100.0, 1e-5), (100, -90), (0, -90), (0, 0)], STREET, **layer)
     place.way([(0, 0), (-90, 0)], STREET).way([(200, 0), (290, 0)], STREET).way(
         [(100, -90), (100, -190)], STREET
     )
@@ -231,3 +231,72 @@ def test_a_box_across_the_date_line_is_cut_there(tmp_path):
     assert [row["capacity"] for row in town.facilities] == [9]
     assert len(town.draft.lanes) == len(whole.draft.lanes)
     assert _square("89.999,0,1000")[1::2] == (-180.0, 180.0)
+
+
+def ring_town():
+    """A car park that is a relation of two ways, around a garden, and nothing else with its tags."""
+    place = Map().way([(0, 0), (100, 0), (200, 0)], STREET, **{"parking:both": "no"})
+    place.way([(0, 0), (0, 90), (200, 90), (200, 0)], STREET, **{"parking:both": "no"})
+    place.way([(200, 90), (290, 90)], STREET, **{"parking:both": "no"})
+    place.way([(100, 20), (160, 20), (160, 70)], {}).way([(160, 70), (100, 70), (100, 20)], {})
+    place.box(110, 30, 120, 40, {}).box(60, 20, 80, 30, {"building": "house"})
+    return place.area([4, 5], [6], amenity="parking", capacity="9", name="Ring")
+
+
+def test_relations_of_answers_with_geometry_are_areas(tmp_path):
+    place = ring_town()
+    want = import_town(place.write(tmp_path / "w.osm"))
+    number, at = place.places()
+    answer = json.loads(overpass(place, geometry=True))
+
+    def member(way, role):
+        corners = [at[number[point]] for point in place.ways[way - 1][0]]
+        line = [{"lat": lat, "lon": lon} for lon, lat in corners]
+        return {"type": "way", "ref": way, "role": role, "geometry": line}
+
+    (outer, inner, tags), *_ = place.areas
+    members = [*(member(way, "outer") for way in outer), *(member(way, "inner") for way in inner)]
+    relation = {"type": "relation", "id": 1, "tags": tags, "members": members}
+    # The ways of the relation are not in the answer on their own.
+    left = [e for e in answer["elements"] if not (e["type"] == "way" and e["id"] in (*outer, *inner))]
+    (tmp_path / "t.json").write_text(json.dumps({"version": 0.6, "elements": [*left, relation]}))
+    town = import_town(tmp_path / "t.json")
+    assert town.facilities == want.facilities
+    assert [(row["name"], row["capacity"]) for row in town.facilities] == [("Ring", 9)]
+
+
+@pytest.mark.parametrize("skeleton_first", [False, True])
+def test_a_relation_that_is_given_again_without_tags_keeps_them(tmp_path, skeleton_first):
+    """As `(._;>;); out body; out skel qt;` gives it."""
+    place = ring_town()
+    xml = place.xml()
+    relation = re.search(r"<relation.*</relation>", xml)[0]
+    skeleton = re.sub(r"<tag [^>]*/>", "", relation)
+    both = (skeleton, relation) if skeleton_first else (relation, skeleton)
+    (tmp_path / "t.osm").write_text(xml.replace(relation, "\n".join(both)))
+    want, town = import_town(place.write(tmp_path / "w.osm")), import_town(tmp_path / "t.osm")
+    assert town.facilities == want.facilities
+
+
+@pytest.mark.parametrize("crs", ["urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326", None])
+def test_streets_of_eight_kilometres_are_in_degrees_as_their_crs_says(tmp_path, crs):
+    place = Map()
+    for k in (0.0, 90):
+        place.way([(0, k), (4_000, k), (4_090, k), (8_000, k)], STREET, **{"parking:both": "lane"})
+        place.way([(4_000 + k, -4_000), (4_000 + k, 0), (4_000 + k, 90), (4_000 + k, 4_000)], STREET)
+    content = json.loads(place.geojson())
+    if crs is not None:
+        content["crs"] = {"type": "name", "properties": {"name": crs}}
+    (tmp_path / "t.geojson").write_text(json.dumps(content))
+    town = import_town(tmp_path / "t.geojson")
+    extent = np.ptp(np.concatenate([lane.points for lane in town.draft.lanes]), axis=0)
+    np.testing.assert_allclose(extent, 8_000, rtol=0.01)
+
+
+def test_conditions_of_roads_are_listed(tmp_path):
+    place = blocks({})
+    place.way([(200, 90), (290, 90)], STREET, **{"motor_vehicle:conditional": "no @ (Sa)", "oneway": "no"})
+    rows = import_town(place.write(tmp_path / "t.osm")).draft.unread
+    assert [(r.tag, r.value, r.assumed) for r in rows] == [
+        ("motor_vehicle:conditional", "no @ (Sa)", "as without it")
+    ]

@@ -191,6 +191,8 @@ def read_roads(
             road = road_of(element.id, element.tags, frame.to_xy(line), town=town)
             if isinstance(road, Road):
                 road = replace(road, left_hand=left_hand)
+                for key in (*ACCESS, "oneway"):
+                    note_unread(element.tags, f"{key}:conditional", "as without it")
                 roads += _parts_between(road, barriers, at, met)
             elif road is not None and element.id not in left_out.setdefault(road, [])[-1:]:
                 left_out[road].append(element.id)
