@@ -171,7 +171,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
 
     | | |
     |---|---|
-    | Import | `from parkenv import lot_v0` |
+    | Import | `from parkenv import lot_v0`; needs `pip install "parkenv[multi]"` |
     | Actions | discrete |
     | Parallel API | yes, `lot_v0.parallel_env()`, which advances by ticks |
     | Manual control | no |

@@ -81,9 +81,14 @@ class SearchAgent(ABC, Generic[Memory]):
         Returns:
             The action, () or (n_envs,) int64, and the state to pass to the next call.
         """
-        if "vertex" not in observation:
+        if not isinstance(observation, Mapping) or "vertex" not in observation:
+            keys = (
+                ", ".join(map(str, observation))
+                if isinstance(observation, Mapping)
+                else type(observation).__name__
+            )
             raise InputError(
-                f'observation holds {", ".join(observation)}, want one of parkenv/Search-v2 with observation="full"'
+                f'observation holds {keys:.120}, want the dictionary of parkenv/Search-v2 with observation="full"'
             )
         return predict_each(self._predict_one, observation, "vertex", 0, state, episode_start)
 

@@ -345,7 +345,7 @@ class LearnedAgent:
         """Choose an action for an observation of `LocalObservation`, as stable-baselines3 does."""
         if "local" not in observation:
             raise InputError(
-                f"{self.name} wants observations of parkenv.envs.local_observation.LocalObservation, "
+                f'{self.name} wants observations of an environment with observation="local", '
                 f"got {', '.join(observation)}"
             )
         given, wanted = observation["local"].shape[-1:], self.model.observation_space["local"].shape

@@ -1,5 +1,6 @@
 """Worlds that follow the counts of a car park."""
 
+import warnings
 from datetime import datetime, timedelta
 
 import gymnasium as gym
@@ -126,6 +127,7 @@ def spec_of(file, mode):
     return ScenarioSpec.parse({"name": "counted", "lot": "mini", "occupancy": occupancy}, "test")
 
 
+@pytest.mark.filterwarnings("ignore:.*readings corrected")
 @pytest.mark.parametrize("mode", ["rolling", "past"])
 def test_no_later_count_reaches_a_forecast(tmp_path, mode):
     first = make_scenario(spec_of(write_counts(tmp_path / "a.csv"), mode)).occupancy
@@ -185,3 +187,22 @@ def test_a_saturday_as_usual_needs_times_free_places_and_their_number_only(tmp_p
     rows = rows_in(tmp_path / "out" / "episodes.csv")
     assert {row["day"] for row in rows} <= {"2024-05-04", "2024-05-11", "2024-05-18", "2024-05-25"}
     assert np.mean([float(row["occupancy"]) for row in rows]) == pytest.approx(0.9, abs=0.1)
+
+
+def test_percentages_and_cleaned_readings_are_told(tmp_path):
+    hours = [datetime(2024, 5, 1) + timedelta(hours=h) for h in range(24 * 7)]
+    share = [100 if 9 <= time.hour < 18 else 30 for time in hours]
+    lines = [f"{time:%d.%m.%Y %H:%M};{part}" for time, part in zip(hours, share, strict=True)]
+    (tmp_path / "belegt.csv").write_text(
+        "\n".join(["Zeit;belegt", *lines, "01.05.2024 12:00;-3"]), encoding="utf-8"
+    )
+    for capacity, warned in ((120, True), (100, False)):
+        occupancy = {"counts": {"file": str(tmp_path / "belegt.csv"), "capacity": capacity}}
+        spec = ScenarioSpec.parse({"name": "c", "lot": "mini", "occupancy": occupancy}, "test")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            make_scenario(spec)
+        told = " ".join(str(warning.message) for warning in caught)
+        assert "readings corrected or left out: " in told
+        assert "duplicate 1" in told
+        assert ("if they are percentages, give --capacity 100" in told) == warned

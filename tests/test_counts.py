@@ -207,14 +207,18 @@ HEADER = "car_park,capacity,hour,free\n"
         ("Zeit;Kapazität\n", "'Zeit, Kapazität', want a column of free or taken places"),
         ("time,zeit,free,capacity\n", "'time' and 'zeit' say the same"),
         ("hour,time,free,capacity\n", "several columns of times"),
-        ("datum;frei;capacity\n01.03.2024;3;9\n", "line 2 is .*, want a time such as"),
-        ("zeit;frei;capacity\n01/03/2024 07:00;3;9\n", "line 2 is .*, want a time such as"),
+        ("datum;frei;capacity\n01.03.2024;3;9\n", "line 2: datum is '01.03.2024', want a time such as"),
+        (
+            "zeit;frei;capacity\n01/03/2024 07:00;3;9\n",
+            "line 2: zeit is '01/03/2024 07:00', want a time such as",
+        ),
         ("zeit;frei;capacity\n01.03.2024 07:00;1.203;1600\n", "has the number '1.203', want whole numbers"),
-        ('time,free,capacity\n2024-03-01 07:00,"1,203",1600\n', "line 2 is .*, and numbers"),
+        ('time,free,capacity\n2024-03-01 07:00,"1,203",1600\n', "line 2: free is '1,203', want a number"),
         (HEADER, "has no readings"),
-        (HEADER + "a,100,yesterday,5\n", "line 2 is .*, want a time such as"),
-        (HEADER + "a,100,2024-01-01,5\n", "line 2 is .*, want a time such as"),
-        (HEADER + "a,100,2024-01-01T00,five\n", "line 2 is .*, and numbers"),
+        ("", "is empty, want a table"),
+        (HEADER + "a,100,yesterday,5\n", "line 2: hour is 'yesterday', want a time such as"),
+        (HEADER + "a,100,2024-01-01,5\n", "line 2: hour is .*, want a time such as"),
+        (HEADER + "a,100,2024-01-01T00,five\n", "line 2: free is 'five', want a number"),
         (HEADER + "a,100,0001-01-01T00,5\na,100,9999-12-31T00,5\n", "over 3,652,059 days, want at"),
         (HEADER + "\x1bred,100,2024-01-01T00,5\n", "want a printable name"),
     ],
@@ -265,6 +269,12 @@ def test_free_and_taken_places_are_the_capacity(tmp_path):
     counts = read(tmp_path, ["2024-03-01T08:00;30;70", "2024-03-01T09:00;20;80"], "hour;free;taken")
     np.testing.assert_allclose(counts.occupied[0, 0, 8:10], [0.7, 0.8])
     np.testing.assert_array_equal(counts.capacity, 100)
+
+
+def test_readings_without_a_value_are_gaps(tmp_path):
+    rows = ["2024-03-01T08:00;k.A.", "2024-03-01T09:00;30", "2024-03-01T10:00;", "2024-03-01T11:00;n/a"]
+    counts = read(tmp_path, rows, "hour;frei", capacity=100)
+    assert np.flatnonzero(np.isfinite(counts.occupied[0, 0])).tolist() == [9]
 
 
 def test_a_capacity_belongs_to_one_car_park_without_its_own(tmp_path):

@@ -221,6 +221,10 @@ class Model:
         Of a search that goes on, the last observation of each slot counts for the day; with `update` after each step,
         all do.
         """
+        if not isinstance(observation, Mapping):
+            raise InputError(
+                f"observation is a {type(observation).__name__}, want the dictionary of parkenv/Search-v2"
+            )
         seen, n = SlotBelief.of_observation(observation), self.problem.lot.n_slots
         if len(seen.p_occupied) != n:
             raise InputError(f"observation has {len(seen.p_occupied)} slots, want {n}, those of the lot")
@@ -251,6 +255,10 @@ class Model:
         its observation has decayed, and others with that of the day; from now on all change at their rates.
         """
         self._require_own(belief)
+        if not isinstance(rng, np.random.Generator):
+            raise InputError(
+                f"rng is {rng!r:.40}, want a numpy.random.Generator, such as np.random.default_rng(0)"
+            )
         require_whole("n", n)
         require_whole("copies", copies, least=1)
         slots = np.flatnonzero(belief.slots.observed)

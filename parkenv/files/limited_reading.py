@@ -112,7 +112,9 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
             damaged = f"not a whole {packed[0]} file ({error})" if packed else error
             raise InputError(f"{path}: {reason or damaged}") from error
         except UnicodeDecodeError as error:
-            raise InputError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
+            raise InputError(
+                f"{path}: not UTF-8 text: {error.reason} at byte {error.start}; save it as UTF-8"
+            ) from error
 
 
 def read_bytes(path: str | Path, most: int = MAX_BYTES) -> bytes:

@@ -39,6 +39,8 @@ NAMES = {
     "time": "time zeit uhrzeit datetime timestamp zeitpunkt zeitstempel datum_zeit datum_uhrzeit",
 }
 """Names of each kind of column, in lower case and with `_` for other characters than letters."""
+UNKNOWN = ("-", "--", "?", "k.a.", "k. a.", "n/a", "na", "null", "none")
+"""Texts of readings without a value, as empty ones."""
 _FORMATS = ("%d.%m.%Y %H:%M", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M", "%Y/%m/%d %H:%M:%S", "%Y-%m-%d %H:%M")
 _AN_INSTANT = timedelta(microseconds=1)
 
@@ -85,14 +87,20 @@ def read_table(path: str | Path, zone: ZoneInfo, capacity: float | None = None) 
         try:
             if moment not in times:
                 times[moment] = _local_hour(moment, zone, utc, before)
-            places, free, taken = (
-                math.nan if i is None else _number(row[i], numbers) for i in (whole, free_at, taken_at)
-            )
         except (ValueError, OverflowError):
+            wanted = "a time such as 2024-03-01T07:00 or 01.03.2024 07:00"
             raise InputError(
-                f"{path}: line {line} is {','.join(row)!r:.80}, want a time such as 2024-03-01T07:00 or 01.03.2024 "
-                "07:00, and numbers"
+                f"{path}: line {line}: {header[when[0]]} is {moment!r:.40}, want {wanted}"
             ) from None
+        values = [math.nan] * 3
+        for k, i in enumerate((whole, free_at, taken_at)):
+            try:
+                values[k] = math.nan if i is None else _number(row[i], numbers)
+            except ValueError:
+                raise InputError(
+                    f"{path}: line {line}: {header[i or 0]} is {row[i or 0]!r:.40}, want a number"
+                ) from None
+        places, free, taken = values
         places = (free + taken if capacity is None else capacity) if whole is None else places
         free = places - taken if free_at is None else free
         table.append((names.setdefault(name, len(names)), *times[moment], places, free))
@@ -105,6 +113,8 @@ def read_table(path: str | Path, zone: ZoneInfo, capacity: float | None = None) 
 
 
 def _columns(path: str | Path, header: Sequence[str], capacity: float | None) -> dict[str, int]:
+    if not header:
+        raise InputError(f"{path}: is empty, want a table of counts")
     at: dict[str, int] = {}
     for i, title in enumerate(header):
         folded = re.sub(r"[\W_]+", "_", title.strip().casefold()).strip("_")
@@ -140,7 +150,8 @@ def _columns(path: str | Path, header: Sequence[str], capacity: float | None) ->
 
 def _number(text: str, known: dict[str, float]) -> float:
     if text not in known:
-        number = text.strip()
+        number = text.strip().lower()
+        number = "" if number in UNKNOWN else number
         if re.fullmatch(r"\d{1,3},\d{3}", number):
             raise ValueError("thousands")
         known[text] = float(number.replace(",", ".") if "." not in number else number) if number else math.nan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import date, timedelta
 from functools import lru_cache
@@ -291,6 +292,7 @@ def _counted(
     elif name not in counts.car_parks:
         counts.chosen([name])  # says which names there are
     row, start, source = counts.car_parks.index(name), 0, f"{spec.file}: car park {name}"
+    _warn_of_counts(counts, row, source, is_stated=spec.capacity is not None)
     if first is None:
         mean, sd = usual_days(counts.occupied[row], counts.weekday, source)
     else:
@@ -305,6 +307,21 @@ def _counted(
         spec.mean_stay_s,
         source,
     )
+
+
+def _warn_of_counts(counts: Counts, row: int, source: str, *, is_stated: bool) -> None:
+    """Tell which readings are not used as they are, and of counts that may be percentages."""
+    faults = {name: n for name, n in counts.faults[row].items() if n and name not in ("summer_time", "gap")}
+    if faults:
+        told = ", ".join(f"{name} {n}" for name, n in faults.items())
+        warnings.warn(f"{source}: readings corrected or left out: {told}", stacklevel=2)
+    taken, whole = counts.occupied[row] * counts.capacity[row, :, None], counts.capacity[row].max()
+    highest = np.nanmax([taken, counts.capacity[row, :, None] - taken], axis=(1, 2)).round(6)
+    if is_stated and whole > 100.0 and 100.0 in highest:
+        warnings.warn(
+            f"{source}: counts end at 100 of {whole:g} places; if they are percentages, give --capacity 100",
+            stacklevel=2,
+        )
 
 
 def _changed(file: Path) -> int:

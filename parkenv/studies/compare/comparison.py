@@ -402,6 +402,9 @@ class Comparison(CaseStudy):
         agents = [row for row in rows if setting(row) == setting(first) and row["agent"] not in UNBEATEN]
         leaders = ", ".join(f"{row['agent']} ({row['total_s']:.1f} s)" for row in agents if row["leads"])
         where = f"On {first['scenario']}, failure cost {first['failure_cost_s']:g} s"
+        for axis, what in (("v_walk_kmh", "walking"), ("v_drive_kmh", "driving")):
+            if len({row[axis] for row in rows}) > 1:
+                where += f", {what} at {first[axis]:g} km/h"
         findings = [f"{where}, no agent is clearly faster than {leaders}."] if len(agents) > 1 else []
         if (measured := summary.get("calibrated")) is not None:
             findings.append(
