@@ -26,7 +26,7 @@ def with_extra(what: str, extra: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise InputError(needs_extra(what, extra)) from error
+        raise InputError(f"{needs_extra(what, extra)} ({error})") from error
 
 
 @contextmanager

@@ -58,13 +58,13 @@ def open_recording(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
 
     Yields the type of each topic, and a function that reads the messages of some topics in order: topic, ns, message.
     """
+    require_file(path)
     require_rosbags()
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.typesys import Stores, get_typestore
 
     _limit_library()
-    require_file(path)
     if path.is_dir():
         for file in path.iterdir():
             require_file(file)
