@@ -25,7 +25,6 @@ from parkenv.files.folder_lock import only_writer
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import Several, require_together
-from parkenv.lots.unread import Unread
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.world.tariff import NO_ZONE
@@ -295,6 +294,7 @@ class Import(Command):
         from parkenv.lots.formats.geojson import check_lot_output
         from parkenv.lots.town.draft import import_town
         from parkenv.lots.town.supply import TABLE
+        from parkenv.lots.unread import Unread
 
         check_lot_output(self.out)
         table, unread_csv, town = self.out.with_suffix(".csv"), self.out.with_suffix(".unread.csv"), None
