@@ -293,6 +293,14 @@ PAID = Rules(per_hour=PRICE, assumed=True)
             {"fee": "yes", "fee:conditional": "no @ stay < 30 min; no @ residents"},
             replace(PAID, free_s=1800.0),
         ),
+        (
+            {"fee:conditional": "yes @ (Mo-Sa 09:00-20:00 AND stay > 30 minutes)"},
+            replace(PAID, charged="Mo-Sa 09:00-20:00", free_s=1800.0),
+        ),
+        (
+            {"maxstay": "2 h", "maxstay:conditional": "no @ (Su)"},
+            Rules(charged="Mo-Sa 00:00-24:00", max_stay_s=7200.0),
+        ),
         ({"fee": "yes", "charge": "1 EUR/h; 5 EUR/day"}, Rules(per_hour=1.0, daily_cap=5.0)),
         (
             {"charge": "3 EUR/h", "charge:conditional": "1 EUR/h @ (18:00-24:00)"},
@@ -406,6 +414,16 @@ def test_durations_are_read_in_all_their_forms(text, minutes):
         *(
             ("Su,PH off", "Mo-Sa 00:00-24:00; Su off"),
             ("PH off", ""),
+            (
+                "Mo-Th 18:00-02:00; Fr,Sa 18:00-04:00",
+                "Mo 18:00-24:00; Tu-Fr 00:00-02:00,18:00-24:00; Sa 00:00-04:00,18:00-24:00; Su 00:00-04:00",
+            ),
+            (
+                "Mo-Sa 08:00-24:00; Su 10:00-26:00",
+                "Mo 00:00-02:00,08:00-24:00; Tu-Sa 08:00-24:00; Su 10:00-24:00",
+            ),
+            ("Fr 22:00-02:00; Sa off", "Mo,Tu,We,Th,Su off; Fr 22:00-24:00; Sa 00:00-02:00"),
+            ('Mo-Fr 10:00-18:00 || "on request"', "Mo-Fr 10:00-18:00; Sa,Su off"),
             ("off", "Mo-Su off"),
             ("Mo-Fr bis 20:00", None),
         ),

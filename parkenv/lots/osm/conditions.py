@@ -86,27 +86,48 @@ def week_of(text: str) -> Week | None:
     with with_extra("hours of OpenStreetMap", "osm"):
         from opening_hours import OpeningHours, ParserError  # type: ignore[attr-defined]
 
-    try:
-        hours = OpeningHours(_plain(text))
-    except ParserError:
-        return None
-    weeks, doubt = [], ""
-    for monday in _WEEKS:
+    doubt = ""
+
+    def minutes_of(rules: str, monday: datetime) -> BoolArray:
+        nonlocal doubt
         minutes = np.zeros(7 * 1440, bool)
-        for begin, end, state, comments in hours.intervals(monday, monday + timedelta(7)):
+        for begin, end, state, comments in OpeningHours(rules).intervals(monday, monday + timedelta(7)):
             first, last = ((t - monday) / timedelta(minutes=1) for t in (begin, end or monday + timedelta(7)))
             minutes[round(first) : round(last)] = str(state) == "open"
             if str(state) == "unknown":
                 doubt = "closed when unknown"
             elif comments and str(state) == "open":
                 doubt = "as without the comment"
-        weeks.append(minutes)
+        return minutes
+
+    usual, *fallback = _plain(text).split("||")
+    try:
+        weeks = [minutes_of(usual, monday) for monday in _WEEKS]
+        for rule in filter(str.strip, usual.split(";") if ";" in usual else ()):
+            # The library forgets what is open past midnight if another rule has the next day.
+            alone = minutes_of(rule, _WEEKS[0])
+            for minutes in weeks:
+                _open_past_midnight(minutes, alone, rule)
+    except ParserError:
+        return None
+    if fallback:
+        doubt = "without what follows ||"
     if _MONTHS.search(text) or any((weeks[0] != other).any() for other in weeks[1:]):
         doubt = "all year as in the second week of June"
     if re.search("sun|dawn|dusk", text):
         doubt = "sunrise at 07:00, sunset at 19:00, dawn at 06:00, dusk at 20:00"
     weeks[0].setflags(write=False)
     return Week(weeks[0], doubt)
+
+
+def _open_past_midnight(minutes: BoolArray, alone: BoolArray, rule: str) -> None:
+    """Open a week after midnight for as long as a rule, `alone`, lasts that was in force before."""
+    for h0, m0, h1, m1 in re.findall(r"(\d?\d):(\d\d)\s*-\s*(\d?\d):(\d\d)", rule):
+        begin, end = 60 * int(h0) + int(m0), 60 * int(h1) + int(m1)
+        for last in range(1439, 7 * 1440, 1440) if end > 1440 or end < begin else ():
+            after = (last + 1 + np.arange(end % 1440)) % (7 * 1440)
+            if minutes[last] and alone[last] and alone[after].all():
+                minutes[after] = True
 
 
 def _plain(text: str) -> str:
@@ -182,7 +203,11 @@ def conditional(tags: Tags, key: str, base: str = "") -> tuple[Conditional, list
                         note_unread(tags, name, "the condition is never met" if week is None else week.doubt)
                     holds = ~always() if week is None else week.minutes
                 minutes = minutes & holds
-            if below and minutes.any():
+            if below < 0.0 and minutes.any() and to.strip().lower() not in ("no", "free", "none", "0"):
+                # What longer stays alone pay is free before.
+                clauses.append((to.strip(), minutes))
+                short.append(("no", -below))
+            elif below and minutes.any():
                 short.append((to.strip(), below))
             elif minutes.any():
                 clauses.append((to.strip(), minutes))

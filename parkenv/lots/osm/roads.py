@@ -316,8 +316,8 @@ def whole_number(text: str | None) -> int | None:
 def count_in(tags: Mapping[str, str], key: str, assumed: str) -> int | None:
     """Return the count that a tag says; a text that is none is listed with what is assumed instead."""
     count = whole_number(tags.get(key))
-    if count is None:
-        note_unread(tags, key, assumed)
+    if count is None or re.search(r"\d\s*[-–]\s*\d", tags[key]):
+        note_unread(tags, key, assumed if count is None else f"{count}, the middle")
     return count
 
 

@@ -240,6 +240,8 @@ def _longest_stay(tags: Mapping[str, str], key: str, limited: BoolArray) -> tupl
             note_unread(tags, key if value == text else f"{key}:conditional", "no limit of stays")
         elif seconds < LONGEST_LIMIT:
             limits.append((seconds, when))
+        else:
+            limits = [(limit, minutes & ~when) for limit, minutes in limits]
     if not limits:
         return None, limited
     if len(limits) > 1:
