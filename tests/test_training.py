@@ -403,7 +403,7 @@ def test_observations_of_another_kind_are_refused_and_a_dead_end_is_waited_at(tr
     agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.safetensors")
     env = gym.make("parkenv/Search-v2", scenario=SCENARIO)
     for observation, wanted in (
-        (env.reset(seed=0)[0], r"wants observations of .*LocalObservation, got vertex, time"),
+        (env.reset(seed=0)[0], r'wants observations of .*observation="local", got vertex, time'),
         (LocalObservation(env, k=7).reset(seed=0)[0], "observes 86 numbers, got 102 for its k = 5"),
     ):
         with pytest.raises(InputError, match=wanted):
