@@ -461,7 +461,7 @@ _Preference = tuple[bool, int, int]
 
 def _preference(feature: Any, element: OsmElement) -> _Preference:
     """Return what sorts the same element given several times: a closed street is a line; the newest; the fullest."""
-    properties = feature.get("properties") or {}
+    properties = feature["properties"] if _is_object(feature, "properties") else {}
     meta = properties.get("meta")
     version = properties.get("@version", meta.get("version") if isinstance(meta, dict) else None)
     is_area = str(feature["geometry"]["type"]).endswith("Polygon") and "highway" in element.tags
