@@ -13,7 +13,7 @@ from parkenv.cli.tables import make_console, print_rows, save_summary, stages
 from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
-from parkenv.scenarios.spec import Date, scenario_spec
+from parkenv.scenarios.spec import Date, Places, scenario_spec
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
@@ -37,9 +37,9 @@ SCORE_COLUMNS = (
 LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
 TimeZone = Annotated[str, Option(takes="NAME")]
 Capacity = Annotated[
-    float | None,
+    Places | None,
     Option(takes="PLACES", default="the file's"),
-    Field(gt=0, le=1e6, description="Places of the car park, for counts without such a column."),
+    Field(description="Places of the car park, for counts without such a column."),
 ]
 
 

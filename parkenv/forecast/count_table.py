@@ -39,6 +39,8 @@ NAMES = {
     "time": "time zeit uhrzeit datetime timestamp zeitpunkt zeitstempel datum_zeit datum_uhrzeit",
 }
 """Names of each kind of column, in lower case and with `_` for other characters than letters."""
+TIMES = ("hour", "hour_utc", "time", "time_utc")
+"""Kinds of columns that say when a reading was taken, one of them in a table; a date may stand beside it."""
 UNKNOWN = ("-", "--", "?", "k.a.", "k. a.", "n/a", "na", "null", "none")
 """Texts of readings without a value, as empty ones."""
 _FORMATS = ("%d.%m.%Y %H:%M", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M", "%Y/%m/%d %H:%M:%S", "%Y-%m-%d %H:%M")
@@ -69,7 +71,7 @@ def read_table(path: str | Path, zone: ZoneInfo, capacity: float | None = None) 
     rows = csv_rows(path, MAX_COUNT_BYTES)
     _, header = next(rows, (0, []))
     at = _columns(path, header, capacity)
-    when = [at[kind] for kind in ("date", "hour", "hour_utc", "time", "time_utc") if kind in at]
+    when = [at[kind] for kind in ("date", *TIMES) if kind in at]
     utc, before = not at.keys().isdisjoint({"hour_utc", "time_utc"}), _AN_INSTANT
     if not at.keys().isdisjoint({"hour", "hour_utc"}):
         before = timedelta(0)
@@ -124,9 +126,7 @@ def _columns(path: str | Path, header: Sequence[str], capacity: float | None) ->
         if kind is not None:
             at[kind] = i
     lacks = {
-        "a column of times (hour, hour_utc, time or time_utc)": at.keys().isdisjoint(
-            {"hour", "hour_utc", "time", "time_utc", "date"}
-        ),
+        "a column of times (hour, hour_utc, time or time_utc)": at.keys().isdisjoint(("date", *TIMES)),
         "a column of free or taken places (free or taken)": at.keys().isdisjoint({"free", "taken"}),
         "the number of places (a column capacity, or --capacity)": capacity is None
         and "capacity" not in at
@@ -141,7 +141,7 @@ def _columns(path: str | Path, header: Sequence[str], capacity: float | None) ->
         )
     if capacity is not None and "capacity" in at:
         raise InputError(f"{path}: has a column {header[at['capacity']]!r}, want no --capacity with it")
-    if len(at.keys() & {"hour", "hour_utc", "time", "time_utc"}) > 1:
+    if len(at.keys() & set(TIMES)) > 1:
         raise InputError(
             f"{path}: has several columns of times, want one of hour, hour_utc, time and time_utc"
         )

@@ -10,8 +10,10 @@ from typing import Annotated, Any
 import numpy as np
 import shapely
 from pydantic import ConfigDict, Field, Strict, create_model
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from parkenv.compiled.arrays import BoolArray
 from parkenv.errors import InputError, naming
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.files.limited_reading import is_there, read_json, read_yaml, unpacked_path
@@ -372,11 +374,17 @@ def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tupl
             )
 
 
+def _reach(lot: ParkingLot) -> tuple[csr_array[np.float64], BoolArray, BoolArray]:
+    """Return the drive graph, and the vertices that an entry leads to, and that lead to a slot or belong to one."""
+    graph = lot.drive_matrix()
+    reached = dijkstra(graph, indices=lot.entry_vertices, min_only=True)
+    to_slot = dijkstra(graph.T.tocsr(), indices=np.arange(lot.n_slots), min_only=True)
+    return graph, np.isfinite(reached), np.isfinite(to_slot)
+
+
 def dead_ends(lot: ParkingLot) -> list[str]:
     """Name places from which no lane leads on, or none to a slot, although cars get there."""
-    graph = lot.drive_matrix()
-    to_slot = np.isfinite(dijkstra(graph.T.tocsr(), indices=np.arange(lot.n_slots), min_only=True))
-    reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
+    graph, reached, to_slot = _reach(lot)
     exits = np.diff(graph.tocsr().indptr) == 0
     texts = []
     for vertex in np.flatnonzero(reached & (exits | ~to_slot)).tolist():
@@ -390,10 +398,7 @@ def _reach_warnings(
     lot: ParkingLot, numbers: Sequence[int | None], entry_numbers: Sequence[int | None]
 ) -> Iterator[LotProblem]:
     n = lot.n_slots
-    graph = lot.drive_matrix()
-    reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
-    # On the reversed graph: the vertices that lead to a slot, or belong to one.
-    to_slot = np.isfinite(dijkstra(graph.T.tocsr(), indices=np.arange(n), min_only=True))
+    graph, reached, to_slot = _reach(lot)
     _, component = connected_components(graph, connection="strong")
     slots_in = np.bincount(component[:n], minlength=component.max() + 1)
     source, target = graph.nonzero()

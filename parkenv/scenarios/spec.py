@@ -210,7 +210,7 @@ def _day_error_text(text: str) -> object:
     return dict(zip(("level", "slope"), numbers_in(text, min(text.count(",") + 1, 2)), strict=False))
 
 
-_Capacity = Annotated[float, Field(gt=0, le=1e6)]
+Places = Annotated[float, Field(gt=0, le=1e6)]
 
 
 class CountsSpec(_Popularity):
@@ -221,7 +221,7 @@ class CountsSpec(_Popularity):
         "time; .csv, .csv.gz."
     )
     car_park: str | None = Field(None, description="Name of the car park in the file, if there are several.")
-    capacity: _Capacity | None = Field(None, description="Places of the car park, if no column has them.")
+    capacity: Places | None = Field(None, description="Places of the car park, if no column has them.")
     timezone: str = Field("Europe/Berlin", description="Local time zone, for `hour_utc` and `time_utc`.")
 
 
@@ -254,7 +254,7 @@ class OccupancySpec(Spec):
         default="the file's only one",
         parse=words_in,
     )
-    capacity: _Capacity | None = option(
+    capacity: Places | None = option(
         None,
         "Places of the car park, for counts without such a column, such as a table of times and free places.",
         takes="PLACES",

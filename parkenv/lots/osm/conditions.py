@@ -43,6 +43,8 @@ FOR_ALL = (
     *("yes", "none", "free", "ticket", "disc", "public", "permissive", "designated", "destination", "motorcar"),
     *("fee", "unknown", "limited", "customary", "car", "use_sidepath", "motor_vehicle", ""),
 )  # fmt: skip
+FREE = ("no", "free", "none", "0")
+"""Values of `fee` and `charge` where nothing is charged."""
 ORDINARY_CAR = {"weight": 1.5, "maxweight": 1.5, "length": 4.5, "width": 1.8, "height": 1.6, "axles": 2.0}
 """Properties of an ordinary car that conditions may ask for: t, m."""
 _OTHERS = (
@@ -203,7 +205,7 @@ def conditional(tags: Tags, key: str, base: str = "") -> tuple[Conditional, list
                         note_unread(tags, name, "the condition is never met" if week is None else week.doubt)
                     holds = ~always() if week is None else week.minutes
                 minutes = minutes & holds
-            if below < 0.0 and minutes.any() and to.strip().lower() not in ("no", "free", "none", "0"):
+            if below < 0.0 and minutes.any() and to.strip().lower() not in FREE:
                 # What longer stays alone pay is free before.
                 clauses.append((to.strip(), minutes))
                 short.append(("no", -below))
@@ -393,7 +395,7 @@ class Charge:
 
 def charge_in(text: str) -> Charge | None:
     """Return the price of an hour or a day that OpenStreetMap's `charge` has; None if it cannot be read."""
-    if text.strip().lower() in ("no", "free", "none", "0"):
+    if text.strip().lower() in FREE:
         return Charge(0.0)
     hourly, daily, doubt = list[float](), list[float](), ""
     for match in _CHARGE.finditer(text):

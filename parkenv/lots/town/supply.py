@@ -30,6 +30,7 @@ from parkenv.files.spec_file import Spec
 from parkenv.lots.draft import LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.osm.conditions import (
+    FREE,
     RESERVED,
     Charge,
     Conditional,
@@ -169,8 +170,8 @@ def _rules(
         paid = paid if named and (paid.any() or fee[0] == "no") else covered
         charge = clauses[-1][0]
     (_, _), short = conditional(tags, fee_key)
-    free_s = max((below for value, below in short if value in FREE and below > 0.0), default=0.0)
-    if any(value not in FREE or below < 0.0 for value, below in short):
+    free_s = max((below for value, below in short if value in NO_FEE and below > 0.0), default=0.0)
+    if any(value not in NO_FEE or below < 0.0 for value, below in short):
         note_unread(tags, f"{fee_key}:conditional", "without the condition on stays")
     by_hour: dict[float, BoolArray] = {}
     for known, when in clauses:
@@ -208,26 +209,25 @@ def _rules(
     )
 
 
-FREE = ("no", "free", "none", "0", "")
-"""Values of `fee` where nothing is charged."""
+NO_FEE = (*FREE, "")  # values of `fee`, or none, where nothing is charged
 
 
 def _paid_at(tags: Mapping[str, str], key: str, fee: Conditional) -> BoolArray:
     """Return when a fee is charged; without a tag, always where the conditions only say when not."""
     base, clauses = fee[0].lower(), fee[1]
-    if not base and clauses and all(value in FREE for value, _ in clauses):
+    if not base and clauses and all(value in NO_FEE for value, _ in clauses):
         base = "yes"
     if base == "unknown":
         note_unread(tags, key, "free")
         base = "no"
-    week = None if base in (*FREE, "yes", "ticket", "paid", "interval") else week_of(base)
+    week = None if base in (*NO_FEE, "yes", "ticket", "paid", "interval") else week_of(base)
     if week is not None:
         if week.doubt:
             note_unread(tags, key, week.doubt)
-        return at_hours(("no", [("yes", week.minutes), *clauses]), lambda value: value not in FREE)
-    if base not in (*FREE, "yes", "ticket", "paid") and charge_in(base) is None:
+        return at_hours(("no", [("yes", week.minutes), *clauses]), lambda value: value not in NO_FEE)
+    if base not in (*NO_FEE, "yes", "ticket", "paid") and charge_in(base) is None:
         note_unread(tags, key, "charged at all times")
-    return at_hours((base, clauses), lambda value: value not in FREE)
+    return at_hours((base, clauses), lambda value: value not in NO_FEE)
 
 
 def _longest_stay(tags: Mapping[str, str], key: str, limited: BoolArray) -> tuple[float | None, BoolArray]:
