@@ -374,7 +374,7 @@ def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tupl
             )
 
 
-def _reach(lot: ParkingLot) -> tuple[csr_array[np.float64], BoolArray, BoolArray]:
+def _reach(lot: ParkingLot) -> tuple["csr_array[np.float64]", BoolArray, BoolArray]:
     """Return the drive graph, and the vertices that an entry leads to, and that lead to a slot or belong to one."""
     graph = lot.drive_matrix()
     reached = dijkstra(graph, indices=lot.entry_vertices, min_only=True)
