@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -77,12 +77,20 @@ class Capture:
         images: frame of each camera by name; a frame also contains the true depth and instance ids.
         pairs: frames of each stereo camera by name.
         scans: ranges of each laser by name, (n_beams,) float32, m, `inf` for no return.
+        moved: for lasers that measured at another moment than the cameras: (3,) x, y, yaw of the vehicle then, in its
+            frame when the pictures were taken.
+        tops: for lasers of several layers: (n_beams,) float32, m, height above the ground of the highest return of what
+            each beam meets; NaN where it is not known.
+        tilt: roll (to the right) and pitch (upwards) of the vehicle against the road, rad.
     """
 
     pose: FloatArray
     images: dict[str, Frame]
     pairs: dict[str, StereoFrame]
     scans: dict[str, NDArray[np.float32]]
+    moved: dict[str, FloatArray] = field(default_factory=dict)
+    tops: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    tilt: tuple[float, float] = (0.0, 0.0)
 
 
 class TimedCapture(NamedTuple):
