@@ -258,7 +258,7 @@ def test_pictures_get_their_poses_by_name_by_exif_or_by_rate(tmp_path):
         (by_time, {"fps": 2.0}, [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1.5, 0, 0]]),
     ):
         taken = Photographs(folder, PhotoOptions(poses=poses, fov=70.0, **more))
-        drive = RecordedDrive(folder, photographs=taken)
+        drive = RecordedDrive(folder, source=taken)
         captures = list(drive.captures())
         np.testing.assert_allclose([pose for _, pose in captures], wanted, atol=1e-9)
         assert drive.rig.cameras[0][1].fx == pytest.approx(32.0 / math.tan(math.radians(35.0)))
@@ -283,7 +283,7 @@ def test_photographs_without_what_they_need_are_refused_in_a_line(tmp_path, pose
     folder = photographs(tmp_path / "photos")
     (folder / "poses.csv").write_text(poses)
     with pytest.raises(InputError, match=names) as caught:
-        RecordedDrive(folder, photographs=Photographs(folder, PhotoOptions(**options)))
+        RecordedDrive(folder, source=Photographs(folder, PhotoOptions(**options)))
     assert "\n" not in str(caught.value)
 
 

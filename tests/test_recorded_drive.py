@@ -13,10 +13,12 @@ from parkenv import InputError, make_scenario
 from parkenv.files.recordings import footage_in
 from parkenv.files.videos import Video
 from parkenv.mapping.drive_calibration import DriveCalibration
+from parkenv.mapping.drive_poses import pose_of
+from parkenv.mapping.drive_writer import Head, recording
 from parkenv.mapping.laser_scans import common_scanner, scan_of
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.mapping.photographs import Photographs
-from parkenv.mapping.recorded_drive import Head, RecordedDrive, _pose_of, recording
+from parkenv.mapping.recorded_drive import RecordedDrive
 from parkenv.mapping.store import MapStore
 from sim_sensors.camera.models import Frame
 from sim_sensors.rig import Capture, SensorRig, TimedCapture
@@ -295,13 +297,13 @@ def test_orientations_of_any_near_norm_say_the_same_heading(norm):
         at = SimpleNamespace(
             position=SimpleNamespace(x=1.0, y=2.0), orientation=SimpleNamespace(x=0.0, y=0.0, z=z, w=w)
         )
-        assert _pose_of(SimpleNamespace(pose=at)) == pytest.approx((1.0, 2.0, yaw))
+        assert pose_of(SimpleNamespace(pose=at))[:3] == pytest.approx((1.0, 2.0, yaw))
         for factor in (0.0, 0.2, 9.0, math.nan):
             at.orientation.z, at.orientation.w = z * factor, w * factor
             with pytest.raises(
                 InputError, match=r"its orientation has the norm .*, want a quaternion of norm 1"
             ):
-                _pose_of(SimpleNamespace(pose=at))
+                pose_of(SimpleNamespace(pose=at))
         at.orientation.z, at.orientation.w = z, w
 
 
@@ -317,7 +319,7 @@ def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_pa
     code = (Path(__file__).parents[1] / "docs/calibration.md").read_text().split("```py\n")[1].split("```")[0]
     exec(compile(code, "calibration.md", "exec"), {})
     taken = Photographs(tmp_path / "photos", PhotoOptions(fov=90.0))
-    photographed = RecordedDrive(tmp_path / "photos", photographs=taken)
+    photographed = RecordedDrive(tmp_path / "photos", source=taken)
     assert photographed.start == 200_000.0
     back = list(photographed.captures())
     np.testing.assert_allclose([pose for _, pose in back], [[2.0 * k, 1.0, 0.1] for k in range(3)])
@@ -328,7 +330,7 @@ def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_pa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"poses": 0}, r"has no poses in /odom, want .*Odometry; it has /camera \(sensor_msgs/msg/Image\)"),
+        ({"poses": 0}, r"has no poses in /odom, want .*Odometry .*; it has /camera \(sensor_msgs/msg/Image\)"),
         ({"shift": {"/odom": 100.0}}, r"/camera ends at .* before /odom begins at .*: do their clocks"),
         ({"shift": {"/scan": -3.0}}, r"/scan ends at .* before /.* begins at .*; want streams that overlap"),
         ({"order": {"/odom": [0, 1, 3, 2, 4]}}, r"/odom: time goes from .* to .* s at message 4, want it"),
@@ -353,7 +355,7 @@ def test_damaged_recordings_are_refused_in_a_line(tmp_path):
         assert "\n" not in str(caught.value)
     file.write_bytes(whole)
     for name, message in (
-        ("bad.mcap", "was not made by parkenv survey --record; describe its sensors"),
+        ("bad.mcap", "was not made by parkenv survey --record, .*; describe its sensors"),
         ("none.mcap", "none.mcap: No such file"),
         ("car.toml", "car.toml: is not a complete recording"),
     ):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, Self, get_args
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, PrivateAttr
 
-from parkenv.cli.options import Command
+from parkenv.cli.options import Command, Given
 from parkenv.cli.tables import make_console, print_rows, print_table, save_summary, stages
 from parkenv.errors import InputError, nearest
 from parkenv.files.atomic_write import make_folder
@@ -31,7 +31,7 @@ MOST_ROWS = 12  # slots in the table of a map; files have all
 
 
 class MapDrive(Command):
-    """A recording of `parkenv survey --record` names its sensors; any other recording needs a calibration file.
+    """A recording names its sensors (`CameraInfo`, TF, KITTI's calibration), or a calibration file does.
 
     For photographs or a film with poses, distances follow from the boxes: from the ground and a car's size.
     """
@@ -46,8 +46,8 @@ class MapDrive(Command):
 
     recording: Path = option(
         ...,
-        "A folder of photographs, or a film; or (extra bags) an MCAP file, or a rosbag of ROS 2 (folder, .db3) or "
-        "ROS 1 (.bag).",
+        "A folder of photographs, of a drive or of KITTI, or a film; or (extra bags) an MCAP file, or a rosbag of "
+        "ROS 2 (folder, .db3) or ROS 1 (.bag).",
         takes="FILE|DIR",
         argument=True,
     )
@@ -64,6 +64,14 @@ class MapDrive(Command):
         "Folder for map.sqlite, to which the session is added, map.png, cars.csv and summary.json.",
         short="-o",
     )
+
+    _names_lot: bool = PrivateAttr(True)
+
+    @classmethod
+    def of(cls, given: Given) -> Self:
+        command = super().of(given)
+        command._names_lot = not given.keys().isdisjoint(("--lot", "--scenario"))
+        return command
 
     def run(self) -> None:
         from parkenv.mapping.drive_calibration import DriveCalibration
@@ -84,6 +92,7 @@ class MapDrive(Command):
                 localise=self.localise,
                 photos=self.photos,
                 lot_file=self.scenario.lot.file,
+                names_lot=self._names_lot,
                 progress=progress,
             )
         save_summary(self.out, None, [row])

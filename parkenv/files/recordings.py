@@ -41,6 +41,13 @@ _NO_PICTURE = re.compile(
 )  # depth, a mosaic of colours, or a film
 _OTHER_PICTURES = re.compile(r"(?i)image|video|packet")  # in names of types of other transports of pictures
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
+CAMERA_INFO, IMU, NAV_FIX = (f"sensor_msgs/msg/{name}" for name in ("CameraInfo", "Imu", "NavSatFix"))
+TRANSFORMS = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
+POSE_2D = "geometry_msgs/msg/Pose2D"
+POSES = (
+    POSE_2D, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry",
+)  # fmt: skip
 
 
 def is_recording(path: Path) -> bool:

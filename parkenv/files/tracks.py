@@ -1,8 +1,10 @@
 """Read the poses of a drive: a CSV table, or the track of a GPX file."""
 
 import math
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from parkenv.files.limited_reading import read_xml
 MONDAY_S = 4 * 86_400  # 1970-01-05, the first Monday of Unix time, s
 _WEEK_S = 604_800  # smaller times are since Monday 00:00
 _UNIX_S = (1e8, 9e9)  # 1973 to 2255; nanoseconds fit 64 bits
+_DECIMAL = re.compile(r"\d+\.\d+")
 _STEP_M = 1.0  # between the positions of which a heading is made
 _GAP_S, _GAP_STEPS = 2.0, 3.0
 """A gap in a track is longer than this, s, and than this multiple of the median time between two points."""
@@ -32,6 +35,7 @@ class Track:
     in_degrees: bool  # which of the two
     yaw: FloatArray  # (n,) rad, counter-clockwise from east; NaN where it is not given
     begins: BoolArray  # (n,) whether the track was interrupted before a position
+    frames: tuple[int, ...] = ()  # (n,) numbers of the pictures; empty if it has none
 
     def headings(self, xy: FloatArray) -> FloatArray:
         """Return the headings, (n,) rad: as given, else the direction from position to position, (n, 2) m.
@@ -58,7 +62,8 @@ class Track:
 def read_track(path: Path, timezone_s: float = 0.0) -> Track:
     """Read a GPX file (`.gpx`), or a CSV table.
 
-    A table has `time` or `file` (a picture's name), or both; `x` and `y` (m in the lot) or `lat` and `lon` (degrees);
+    A table has `time` (or `unix_s`, which counts if there are both), `file` (a picture's name), or both, `frame` (its
+    number) if that is known; `x` and `y` (m in the lot) or `lat` and `lon` (degrees);
     and, if they are known, `yaw` (rad, counter-clockwise from x) or `heading` (degrees, clockwise from north). Other
     columns are skipped. A time is a date, of the place if it has no zone, Unix time from 1e8 s on, or, below 604,800 s,
     time since Monday 00:00; `timezone_s` is the time of the place minus UTC.
@@ -67,6 +72,10 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
     time = Kind(wanted, lambda text: stamp_in(text, timezone_s))
     kinds = dict.fromkeys(("x", "y", "lat", "lon", "heading"), NUMBER) | {"time": time}
     kinds["yaw"] = Kind("radians, -6.3 to 6.3", _angle)
+    kinds |= {
+        "unix_s": time,
+        "frame": Kind("a number of a picture", lambda text: int(text) if text.isdecimal() else -1),
+    }
     if path.suffix.lower() == ".gpx":
         texts = [
             p.attrib | {"time": (p.findtext("{*}time") or "").strip(), "segment": str(number)}
@@ -87,6 +96,7 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
         raise InputError(f"{path}: no such file")
     else:
         rows = [row for _, row in typed_records(path, lambda name: kinds.get(name, TEXT))]
+        rows = [row | {"time": row["unix_s"]} if "unix_s" in row else row for row in rows]
     has = rows[0].keys() if rows else set()
     pair = ("x", "y") if "x" in has else ("lon", "lat")
     if not has >= set(pair) or not has & {"time", "file"}:
@@ -108,7 +118,8 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
     begins = np.array([k == 0 or part != parts[k - 1] for k, part in enumerate(parts)])
     seconds = np.diff(stamps) / 1e9
     begins[1:] |= seconds > max(_GAP_S, _GAP_STEPS * float(np.median(seconds)) if seconds.size else 0.0)
-    return Track(stamps, files, at, pair[0] == "lon", np.array(turned), begins)
+    frames = tuple(row["frame"] for row in rows if "frame" in has)
+    return Track(stamps, files, at, pair[0] == "lon", np.array(turned), begins, frames)
 
 
 def stamp_in(text: str, timezone_s: float) -> int:
@@ -124,6 +135,8 @@ def stamp_in(text: str, timezone_s: float) -> int:
         seconds = date.replace(microsecond=0, tzinfo=date.tzinfo or UTC).timestamp()
     if not _UNIX_S[0] <= seconds <= _UNIX_S[1]:
         raise ValueError(text)
+    if _DECIMAL.fullmatch(text):  # nanoseconds, which floats are too short for
+        return round(Decimal(text) * 10**9)
     return round((seconds - shift) * 1e9) + fraction
 
 

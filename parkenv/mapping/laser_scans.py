@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from parkenv.compiled.arrays import Float32Array
+from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.scanner import LaserScanner
@@ -23,6 +23,7 @@ class Scan(NamedTuple):
     step: float  # rad, above 0
     max_range: float  # m
     ranges: Float32Array  # (n,) m; inf without a hit
+    delay: float = 0.0  # s between two beams; below 0 if the last one is the first in time
 
 
 def scan_of(message: Any) -> Scan:
@@ -49,9 +50,42 @@ def scan_of(message: Any) -> Scan:
             f"a scan has {len(ranges)} beams {abs(step):g} rad apart, want {most} at most, a full turn"
         )
     ranges = ranges[:most]
+    delay = float(getattr(message, "time_increment", 0.0))
     if step < 0.0:
+        delay = -delay
         start, step, ranges = start + (len(ranges) - 1) * step, -step, ranges[::-1]
-    return Scan(start, step, high, np.ascontiguousarray(ranges))
+    return Scan(start, step, high, np.ascontiguousarray(ranges), delay)
+
+
+def mirrored(scan: Scan) -> Scan:
+    """Return the scan of a scanner that hangs upside down, as one that stands upright measures it."""
+    end = scan.start + (len(scan.ranges) - 1) * scan.step
+    return scan._replace(start=-end, ranges=np.ascontiguousarray(scan.ranges[::-1]), delay=-scan.delay)
+
+
+def without_motion(scan: Scan, moved: FloatArray) -> Scan:
+    """Return the scan as measured from where the scanner was at its begin.
+
+    `moved`, (n, 3), is where it was at each beam: x, y and yaw in its frame at the begin. Each beam takes the range of
+    the return that is next in angle, at most a step away.
+    """
+    hit = np.isfinite(scan.ranges)
+    if not hit.any():
+        return scan
+    beams = scan.start + scan.step * np.arange(len(scan.ranges))
+    angle = beams[hit] + moved[hit, 2]
+    x = moved[hit, 0] + scan.ranges[hit] * np.cos(angle)
+    y = moved[hit, 1] + scan.ranges[hit] * np.sin(angle)
+    middle = 0.5 * (beams[0] + beams[-1])
+    place = (np.arctan2(y, x) - middle + math.pi) % _TURN + middle - math.pi
+    order = np.argsort(place, kind="stable")
+    place, distance = place[order], np.hypot(x, y)[order]
+    after = np.searchsorted(place, beams)
+    sides = np.stack([np.maximum(after - 1, 0), np.minimum(after, len(place) - 1)])
+    off = np.abs(place[sides] - beams)
+    near = np.take_along_axis(sides, off.argmin(axis=0)[None], axis=0)[0]
+    ranges = np.where(off.min(axis=0) <= scan.step, distance[near], np.inf)
+    return scan._replace(ranges=ranges.astype(np.float32))
 
 
 def common_scanner(scans: Sequence[Scan]) -> tuple[LaserScanner, list[Float32Array]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,34 +15,23 @@ import numpy as np
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, naming
 from parkenv.files.images import image_time, images_in, read_image
-from parkenv.files.limited_reading import read_bytes
-from parkenv.files.recordings import IMAGE, Messages
+from parkenv.files.recordings import IMAGE, POSE_2D, Messages
 from parkenv.files.tracks import Track, read_track, stamp_in
 from parkenv.files.videos import VIDEO_SUFFIXES, Video
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, MountSpec
+from parkenv.mapping.drive_sources import PictureFile, Stream
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.perception.monocular import RangingErrors
 from sim_sensors.camera.models import PinholeCamera
 
 POSES = "poses.csv"  # the poses beside the pictures, if no others are named
-_POSE = "geometry_msgs/msg/Pose2D"
 _GNSS_M, _TRACK_YAW = 3.0, math.radians(3.0)
 
 
 def is_photographs(path: Path) -> bool:
     """Whether a path is named like a film, or is a folder that is no rosbag."""
     return path.suffix.lower() in VIDEO_SUFFIXES or (path.is_dir() and not (path / "metadata.yaml").is_file())
-
-
-@dataclass(frozen=True)
-class _File:
-    path: Path
-    format: str = "file"
-
-    @property
-    def data(self) -> bytes:
-        return read_bytes(self.path)
 
 
 class Photographs:
@@ -66,7 +55,8 @@ class Photographs:
             calibration = DriveCalibration(cameras=(self._usual_camera(),))
         if len(calibration.cameras) != 1 or calibration.stereo_cameras or calibration.lasers:
             raise InputError(f"{calibration._file or path}: want one camera, which took the pictures")
-        self.calibration = calibration
+        self.calibration: DriveCalibration | None = calibration
+        self._pose, self._picture = calibration.pose, calibration.cameras[0].topic
         self._zone_s = 3600.0 * calibration.timezone_h
         poses = options.poses or (path if path.is_dir() else path.parent) / POSES
         if options.poses is None and not poses.is_file():
@@ -75,36 +65,30 @@ class Photographs:
             )
         self.track = read_track(poses, self._zone_s)
         with naming(poses):
-            xy = self._in_metres(self.track, frame)
-            self._poses = np.column_stack([xy, self.track.headings(xy)])
-        usual = _GNSS_M if self.track.in_degrees else 0.0
-        self.errors = RangingErrors.of_poses(
-            usual if options.pose_error is None else options.pose_error,
-            _TRACK_YAW if np.isnan(self.track.yaw).any() else 0.0,
-        )
+            self._poses = pose_stream(self.track, in_metres(self.track, options, frame))
+        self.errors: RangingErrors | None = errors_of_poses(self.track, options)
         pictures = len(self._files)
         self._stamps = self._times() if self._film is None else None
         self.without_pose = pictures - len(self._files)
 
     @contextmanager
     def open(self) -> Iterator[tuple[dict[str, str], Messages]]:
-        pose, picture = self.calibration.pose, self.calibration.cameras[0].topic
+        pose, picture = self._pose, self._picture
 
         def messages(topics: set[str]) -> Iterator[tuple[str, int, Any]]:
             if pose in topics:
-                for stamp, (x, y, yaw) in zip(self.track.stamps.tolist(), self._poses.tolist(), strict=True):
-                    if not math.isnan(yaw):  # pictures at one without a heading are left out
-                        yield pose, stamp, SimpleNamespace(x=x, y=y, theta=yaw)
+                for stamp, make in self._poses[1]:
+                    yield pose, stamp, make()
             if picture in topics:
                 for stamp, message in self._pictures():
                     yield picture, stamp, message
 
-        yield {pose: _POSE, picture: IMAGE}, messages
+        yield {pose: POSE_2D, picture: IMAGE}, messages
 
     def _pictures(self) -> Iterator[tuple[int, Any]]:
         if self._stamps is not None:
             for k in np.argsort(self._stamps, kind="stable").tolist():
-                yield int(self._stamps[k]), _File(self._files[k])
+                yield int(self._stamps[k]), PictureFile(self._files[k], None)
             return
         begin, fps = int(self.track.stamps[0]), self._options.fps
         for frame in self._film.read() if self._film is not None else ():
@@ -152,12 +136,32 @@ class Photographs:
         parsed = MountSpec.parse(mount, dict.fromkeys(mount, "--mount"))
         return CameraSpec(name="camera", mount=parsed, **numbers)
 
-    def _in_metres(self, track: Track, frame: LocalFrame | None) -> FloatArray:
-        if not track.in_degrees:
-            return track.positions
-        if self._options.origin is not None:
-            lat, lon = self._options.origin
-            frame = LocalFrame(lon, lat)
-        if frame is None:
-            raise InputError("is in degrees, and the lot in metres; want --origin LAT,LON of its x = y = 0")
-        return frame.to_xy(track.positions)
+
+def in_metres(track: Track, options: PhotoOptions, frame: LocalFrame | None) -> FloatArray:
+    """Return the positions of a track in the lot, (n, 2) m; `frame` is that of a lot whose file has degrees."""
+    if not track.in_degrees:
+        return track.positions
+    if options.origin is not None:
+        lat, lon = options.origin
+        frame = LocalFrame(lon, lat)
+    if frame is None:
+        raise InputError("is in degrees, and the lot in metres; want --origin LAT,LON of its x = y = 0")
+    return frame.to_xy(track.positions)
+
+
+def pose_stream(track: Track, xy: FloatArray) -> Stream:
+    """Return the poses of a track as messages; pictures at one without a heading are left out."""
+    poses = np.column_stack([xy, track.headings(xy)]).tolist()
+    return POSE_2D, [
+        (stamp, partial(SimpleNamespace, x=x, y=y, theta=yaw))
+        for stamp, (x, y, yaw) in zip(track.stamps.tolist(), poses, strict=True)
+        if not math.isnan(yaw)
+    ]
+
+
+def errors_of_poses(track: Track, options: PhotoOptions) -> RangingErrors:
+    usual = _GNSS_M if track.in_degrees else 0.0
+    return RangingErrors.of_poses(
+        usual if options.pose_error is None else options.pose_error,
+        _TRACK_YAW if np.isnan(track.yaw).any() else 0.0,
+    )

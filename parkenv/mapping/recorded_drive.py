@@ -1,22 +1,19 @@
-"""Recorded drives: images, scans and poses in MCAP files and rosbags, written and read by the library rosbags.
+"""Recorded drives: timed captures and poses from what a source reads: bags, MCAP files, folders, photographs, films.
 
-Each picture of the first camera is a capture. What other sensors measured nearest in time, at most `PAIR_S` away,
-joins it. The car's pose is interpolated to the picture's time: linearly between the poses before and after, at most
-`GAP_S` apart, the heading along the shorter arc; a pose at exactly that time is taken as it is. Pictures without pose
-or partner are left out. Times are those of the messages' headers, of messages without header those of the recording.
+Each picture of the first camera is a capture. What other sensors measured nearest in time joins it: the other picture
+of a stereo pair at most `PAIR_S` away, another camera `CAMERAS_S`, a laser `LASER_S`, with where the vehicle was then.
+The car's pose is interpolated to the picture's time: linearly between the poses before and after, at most 2 s apart,
+the heading along the shorter arc; a pose at exactly that time is taken as it is. Pictures without pose or partner are
+left out. Times are those of the messages' headers, of messages without header those of the recording.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,57 +21,43 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, naming
-from parkenv.files.atomic_write import atomic_write, check_writable
 from parkenv.files.limited_reading import parse_json
 from parkenv.files.recordings import (
     COMPRESSED_IMAGE,
-    IMAGE,
+    NAV_FIX,
+    SCAN,
+    TRANSFORMS,
     Messages,
-    open_recording,
     picture_in,
-    require_rosbags,
     stamp_of,
 )
-from parkenv.files.spec_file import Spec
-from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, Lens, StereoSpec
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.mapping.drive_calibration import DriveCalibration
+from parkenv.mapping.drive_poses import PoseReader, PoseTrack, within
+from parkenv.mapping.drive_setup import DriveSetup, set_up
+from parkenv.mapping.drive_sources import Bag, Source
+from parkenv.mapping.drive_writer import HEAD, POSE, RECORDED_MONDAY_S, Head
 from parkenv.mapping.grid import OccupancyGrid
-from parkenv.mapping.laser_scans import Scan, common_scanner, scan_of
-from parkenv.mapping.photographs import Photographs
+from parkenv.mapping.laser_scans import Scan, common_scanner, mirrored, scan_of, without_motion
+from parkenv.mapping.lenses import Picture
+from parkenv.mapping.point_clouds import SCANNER, CloudScan, Road, fit_road, points_of, scan_of_cloud
 from parkenv.mapping.store import Session
-from parkenv.mapping.survey import SessionMap, Survey
+from parkenv.mapping.survey import SessionMap
 from parkenv.perception.detector import Detector
+from parkenv.perception.monocular import RangingErrors
 from parkenv.perception.pipeline import CameraView, PerceptionPipeline
 from parkenv.perception.slot_filter import SlotStates
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import DAY_S
 from sim_sensors.camera.models import Frame, StereoFrame
-from sim_sensors.errors import SensorError
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, TimedCapture
 
-PAIR_S = 0.1  # longest time between a picture and what other sensors measured with it, s
-GAP_S = 2.0  # longest time between two poses that a pose is interpolated between, s
-HEAD, POSE = "/parkenv/drive", "/pose"
-_MONDAY_S = 1_704_067_200  # 2024-01-01; drives are recorded as if in the week from this Monday on
-_NORMS = 0.5, 1.5  # of quaternions that are taken for rounded ones of norm 1, and normalised
-_STRING, _POSE_2D = "std_msgs/msg/String", "geometry_msgs/msg/Pose2D"
-_SCAN = "sensor_msgs/msg/LaserScan"
-_TYPES = {
-    "pose": (_POSE_2D, *(f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "PoseWithCovarianceStamped")),
-             "nav_msgs/msg/Odometry"),
-    "image": (COMPRESSED_IMAGE, IMAGE),
-    "scan": (_SCAN,),
-}  # fmt: skip
+PAIR_S, CAMERAS_S, LASER_S = 0.001, 0.1, 0.5
+"""Longest times between a picture and what joins it, s: the right picture of a pair, another camera, a laser."""
+FAR_M = 500.0  # farther from the lot are poses of another frame
+_STILL = 1e-3, 1e-4  # m and rad in a scan, below which nothing is to correct
 _NO_DEPTH, _NO_IDS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
-
-
-class Head(Spec, extra="ignore"):
-    """What identifies a session: its key, start (s since Monday 00:00), rig and weather."""
-
-    key: str
-    time: float
-    rig: str
-    weather: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,122 +70,81 @@ class MappedDrive:
     cars: list[dict[str, Any]]  # each located car: time, place, distance and slot, with standard deviations
 
 
-class DriveWriter:
-    def __init__(self, writer: Any, rig: SensorRig, store: Any) -> None:
-        self._writer, self._rig, self._store, self._last = writer, rig, store, 0
-        self._connections: dict[str, Any] = {}
-
-    def add(self, captured: TimedCapture, vehicle: FloatArray) -> None:
-        """Append a capture and the pose of the vehicle by its odometry, (3,)."""
-        stamp = _MONDAY_S * 10**9 + round(captured.time * 1e9)
-        x, y, yaw = (float(v) for v in vehicle)
-        self._send(POSE, _POSE_2D, stamp, x=x, y=y, theta=yaw)
-        capture = captured.capture
-        for name, _, _ in self._rig.cameras:
-            self._send_image(f"/{name}/image/compressed", stamp, capture.images[name].image)
-        for name, _, _ in self._rig.stereo_cameras:
-            self._send_image(f"/{name}/left/image/compressed", stamp, capture.pairs[name].left.image)
-            self._send_image(f"/{name}/right/image/compressed", stamp, capture.pairs[name].right.image)
-        for name, laser, _ in self._rig.lasers:
-            self._send(
-                f"/{name}/scan", _SCAN, stamp, header=self._header(stamp, name), angle_min=laser.start,
-                angle_max=laser.start + (laser.n_beams - 1) * laser.step, angle_increment=laser.step,
-                time_increment=0.0, scan_time=0.0, range_min=0.0, range_max=laser.max_range, ranges=capture.scans[name],
-                intensities=np.zeros(0, np.float32),
-            )  # fmt: skip
-
-    def close(self, head: Head) -> None:
-        self._send(HEAD, _STRING, self._last, data=json.dumps(head.model_dump()))
-
-    def _send_image(self, topic: str, stamp: int, image: NDArray[np.uint8]) -> None:
-        data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
-        self._send(topic, COMPRESSED_IMAGE, stamp, header=self._header(stamp, topic), format="png", data=data)
-
-    def _send(self, topic: str, kind: str, stamp: int, **parts: Any) -> None:
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
-        message = self._store.types[kind](**parts)
-        self._last = max(self._last, stamp)
-        self._writer.write(self._connections[topic], stamp, self._store.serialize_cdr(message, kind))
-
-    def _header(self, stamp: int, frame: str) -> Any:
-        types = self._store.types
-        time = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
-        return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
-
-
-@contextmanager
-def recording(path: Path, rig: SensorRig) -> Iterator[DriveWriter]:
-    """Write a drive to an MCAP file, atomically; images are stored without loss."""
-    require_recordable(path)
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    with atomic_write(path) as beside:
-        folder = Path(tempfile.mkdtemp(prefix=".drive", dir=path.absolute().parent))
-        try:
-            with Writer(folder / "drive", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-                yield DriveWriter(writer, rig, get_typestore(Stores.ROS2_HUMBLE))
-            (recording,) = (folder / "drive").glob("*.mcap")
-            recording.replace(beside)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def require_recordable(path: Path) -> None:
-    require_rosbags()
-    if path.suffix != ".mcap":
-        raise InputError(f"{path}: want a name that ends in .mcap")
-    check_writable(path)
+class _Taken(NamedTuple):
+    stamp: int  # ns, of the picture
+    partners: dict[str, int]  # index of the message of each sensor, by key
+    pose: FloatArray
 
 
 @dataclass(eq=False)
 class RecordedDrive:
-    """A recorded drive: an MCAP file, a rosbag of ROS 2 (folder, .mcap or .db3) or of ROS 1 (.bag).
+    """A recorded drive.
 
     Args:
-        path: the file or folder.
-        calibration: sensors and topics; None for a recording of `parkenv survey --record`.
-        photographs: what takes the place of a recording; its calibration counts.
+        path: an MCAP file, a rosbag of ROS 2 (folder, .mcap or .db3) or of ROS 1 (.bag), or what `source` reads.
+        calibration: sensors and topics; None where the recording says them itself.
+        source: what reads the path, None for a bag; its calibration counts.
+        frame: that of the lot, for poses in degrees; None for one around the first pose.
     """
 
     path: Path
     calibration: DriveCalibration | None = None
-    photographs: Photographs | None = None
+    source: Source | None = None
+    frame: LocalFrame | None = None
     rig: SensorRig = field(init=False)
     head: Head | None = field(init=False, default=None)
     poses: FloatArray = field(init=False)  # (n, 3) x, y, yaw in the lot
     pose_s: FloatArray = field(init=False)  # (n,) s, Unix time relative to `_start`
+    errors: RangingErrors | None = field(init=False, default=None)  # of the poses, where they are known
 
     def __post_init__(self) -> None:
-        self._topics: dict[str, str] = {}  # by sensor: pose, image:NAME:SIDE, scan:NAME
-        self._lenses: dict[str, Lens] = {}
-        self._stamps: dict[str, list[int]] = {}
+        source = self.source or Bag(self.path)
+        self._source, self.calibration = source, source.calibration or self.calibration
+        self._measured: dict[str, list[Scan]] = {}
         self._scans: dict[str, list[NDArray[np.float32]]] = {}
         self._scanners: dict[str, LaserScanner] = {}
-        self._measured: dict[str, list[Scan]] = {}
-        poses: list[tuple[float, float, float]] = []
-        if self.photographs is not None:
-            self.calibration = self.photographs.calibration
-        with self._open() as (topics, messages):
-            self._plan(topics)
-            wanted = {topic: key for key, topic in self._topics.items()}
-            self._stamps = {key: [] for key in self._topics}
-            for topic, stamp, message in messages({*wanted, HEAD}):
-                if topic == HEAD:
-                    content = parse_json(message.data, f"{self.path}: {HEAD}", finite=True)
-                    self.head = Head.parse(
-                        content if isinstance(content, dict) else {}, f"{self.path}: {HEAD}"
-                    )
+        with source.open() as (topics, messages):
+            is_survey = self.calibration is None and HEAD in topics
+            if is_survey:
+                self._setup = _setup_of_survey(topics)
+            else:
+                self._setup = set_up(self.path, self.calibration, topics, messages)
+            self._topics = self._setup.topics
+            kind = topics.get(self._topics["pose"], "")
+            reader = PoseReader(kind, self._setup.tree, self._setup.base, self.frame)
+            self._read(messages, reader)
+            if is_survey and (self.head is None or self.head.rig not in RIG_NAMES):
+                raise InputError(f"{self.path}: {HEAD} names no rig of {', '.join(RIG_NAMES)}")
+            self._finish(reader)
+        self.errors = source.errors
+        if kind == NAV_FIX and reader.std:
+            self.errors = RangingErrors.of_poses(reader.std, 0.0)
+
+    def _read(self, messages: Messages, reader: PoseReader) -> None:
+        """Read poses, scans, and the times of all."""
+        wanted = {topic: key for key, topic in self._topics.items()}
+        self._stamps: dict[str, list[int]] = {key: [] for key in self._topics}
+        for topic, recorded, message in messages(
+            {*wanted, HEAD} - ({self._topics["pose"]} if reader.kind in TRANSFORMS else set())
+        ):
+            if topic == HEAD:
+                content = parse_json(message.data, f"{self.path}: {HEAD}", finite=True)
+                self.head = Head.parse(content if isinstance(content, dict) else {}, f"{self.path}: {HEAD}")
+                continue
+            key, stamp = wanted[topic], stamp_of(message, recorded)
+            name = key.partition(":")[2]
+            with naming(f"{self.path}: {topic}: message {len(self._stamps[key]) + 1}"):
+                if key == "pose" and not reader.add(message):
                     continue
-                key = wanted[topic]
-                self._add_stamp(key, stamp_of(message, stamp))
-                if key == "pose":
-                    with naming(f"{self.path}: {topic}: pose {len(poses) + 1}"):
-                        poses.append(_pose_of(message))
-                elif key.startswith("scan:"):
-                    self._add_scan(key[5:], message)
-        self._finish(np.array(poses, dtype=np.float64).reshape(-1, 3))
+                if key == "imu":
+                    reader.add_imu(stamp, message)
+                elif key.startswith("scan:") and name not in self._setup.clouds:
+                    scan = scan_of(message)
+                    hangs = (
+                        math.cos(self._setup.lasers[name].roll) < 0.0 if name in self._setup.lasers else False
+                    )
+                    self._measured.setdefault(name, []).append(mirrored(scan) if hangs else scan)
+            self._add_stamp(key, stamp)
 
     @property
     def key(self) -> str:
@@ -213,69 +155,45 @@ class RecordedDrive:
         if self.head is not None:
             return self.head.time
         zone = self.calibration.timezone_h * 3600.0 if self.calibration else 0.0
-        return (self._stamps["pose"][0] / 1e9 + zone - _MONDAY_S) % (7.0 * DAY_S)
+        return (self._stamps["pose"][0] / 1e9 + zone - RECORDED_MONDAY_S) % (7.0 * DAY_S)
 
     @property
     def without_pose(self) -> int:
         """Number of pictures of the first camera that have no pose, and are left out."""
-        return sum(self.pose_at(stamp) is None for stamp in self._stamps[self._first]) + (
-            self.photographs.without_pose if self.photographs else 0
-        )
+        stamps = self._stamps[self._first]
+        return sum(self.pose_at(stamp) is None for stamp in stamps) + self._source.without_pose
+
+    @property
+    def without_partner(self) -> int:
+        """Number of pictures of the first camera with a pose but without measurements of all other sensors."""
+        stamps = [stamp for stamp in self._stamps[self._first] if self.pose_at(stamp) is not None]
+        return sum(self._partners(stamp) is None for stamp in stamps)
 
     def captures(self, every: float = 0.0) -> Iterator[tuple[TimedCapture, FloatArray]]:
         """Yield captures at least `every` m apart, and the vehicle's pose of each, (3,) x, y in m and yaw in rad."""
         plan = self._frames(every)
+        late = {key for key in self._topics if key.startswith("image:") or key[5:] in self._setup.clouds}
         needed: dict[tuple[str, int], list[int]] = {}
-        for k, (_, partners, _) in enumerate(plan):
-            for key, index in partners.items():
-                if not key.startswith("scan:"):
-                    needed.setdefault((key, index), []).append(k)
-        images: list[dict[str, NDArray[np.uint8]]] = [{} for _ in plan]
+        for k, taken in enumerate(plan):
+            for key in late:
+                needed.setdefault((key, taken.partners[key]), []).append(k)
+        parts: list[dict[str, Any]] = [{} for _ in plan]
         count = dict.fromkeys(self._topics, -1)
-        cameras = {topic: key for key, topic in self._topics.items() if key.startswith("image:")}
+        keys = {self._topics[key]: key for key in late}
         done = 0
-        with self._open() as (_, messages):
-            for topic, _, message in messages(set(cameras)):
-                key = cameras[topic]
+        with self._source.open() as (_, messages):
+            for topic, _, message in messages(set(keys)):
+                key = keys[topic]
                 count[key] += 1
-                for k in needed.get((key, count[key]), ()):
-                    images[k][key] = self._decoded(key, message, count[key])
-                while done < len(plan) and len(images[done]) == len(cameras):
-                    yield self._capture(plan[done], images[done])
-                    images[done] = {}
+                if takers := needed.get((key, count[key]), ()):
+                    read = self._decoded if key.startswith("image:") else self._cloud
+                    part = read(key, message, count[key])
+                    for k in takers:
+                        parts[k][key] = part
+                while done < len(plan) and len(parts[done]) == len(late):
+                    yield self._capture(plan[done], parts[done])
+                    parts[done] = {}
                     done += 1
-
-    def _open(self) -> AbstractContextManager[tuple[dict[str, str], Messages]]:
-        return open_recording(self.path) if self.photographs is None else self.photographs.open()
-
-    def _plan(self, topics: dict[str, str]) -> None:
-        self._topics = {"pose": self.calibration.pose if self.calibration else POSE}
-        if self.calibration is not None:
-            cameras: list[tuple[CameraSpec | StereoSpec, str, str]]
-            cameras = [(camera, "mono", camera.topic) for camera in self.calibration.cameras]
-            for pair in self.calibration.stereo_cameras:
-                cameras += [(pair, "left", pair.left), (pair, "right", pair.right)]
-            self._lenses = {f"image:{camera.name}:{side}": camera for camera, side, _ in cameras}
-            self._topics |= {f"image:{camera.name}:{side}": topic for camera, side, topic in cameras}
-            self._topics |= {f"scan:{laser.name}": laser.topic for laser in self.calibration.lasers}
-        elif HEAD not in topics:
-            raise InputError(
-                f"{self.path}: was not made by parkenv survey --record; describe its sensors: --calibration"
-            )
-        else:
-            for topic, kind in topics.items():
-                name, _, what = topic[1:].partition("/")
-                if kind == _SCAN:
-                    self._topics[f"scan:{name}"] = topic
-                elif kind == COMPRESSED_IMAGE:
-                    side = what.partition("/")[0] if what.startswith(("left", "right")) else "mono"
-                    self._topics[f"image:{name}:{side}"] = topic
-        for key, topic in self._topics.items():
-            kind = key.partition(":")[0]
-            if topics.get(topic) not in _TYPES[kind]:
-                there = ", ".join(f"{t} ({kind})" for t, kind in sorted(topics.items())[:12]) or "nothing"
-                wanted = " or ".join(_TYPES[kind])
-                raise InputError(f"{self.path}: has no {kind}s in {topic}, want {wanted}; it has {there}")
 
     def _add_stamp(self, key: str, stamp: int) -> None:
         before = self._stamps[key]
@@ -286,12 +204,10 @@ class RecordedDrive:
             )
         before.append(stamp)
 
-    def _add_scan(self, name: str, message: Any) -> None:
-        with naming(f"{self.path}: {self._topics[f'scan:{name}']}"):
-            self._measured.setdefault(name, []).append(scan_of(message))
-
-    def _finish(self, poses: FloatArray) -> None:
-        """Check that the streams have something in common, and make the rig."""
+    def _finish(self, reader: PoseReader) -> None:
+        """Check that the streams have something in common, and make poses, scans and the rig."""
+        with naming(f"{self.path}: {self._topics['pose']}"):
+            self._stamps["pose"], poses = reader.poses(self._stamps["pose"])
         spans = {}
         for key, stamps in self._stamps.items():
             topic = self._topics[key]
@@ -299,7 +215,7 @@ class RecordedDrive:
                 raise InputError(f"{self.path}: {topic} has no messages")
             spans[topic] = (stamps[0] / 1e9, stamps[-1] / 1e9)
         low, high = max(s[0] for s in spans.values()), min(s[1] for s in spans.values())
-        if low > high + PAIR_S:
+        if low > high + CAMERAS_S:
             late, early = (t for value, k in ((low, 0), (high, 1)) for t, s in spans.items() if s[k] == value)
             raise InputError(
                 f"{self.path}: {early} ends at {high:.3f} s, before {late} begins at {low:.3f} s; want streams that "
@@ -307,35 +223,36 @@ class RecordedDrive:
             )
         if not np.isfinite(poses).all():
             bad = int(np.flatnonzero(~np.isfinite(poses).all(axis=1))[0])
-            raise InputError(f"{self.path}: {self._topics['pose']}: pose {bad + 1} is {poses[bad].tolist()}")
-        self.poses = poses
-        for name, scans in self._measured.items():
-            with naming(f"{self.path}: {self._topics[f'scan:{name}']}"):
-                self._scanners[name], self._scans[name] = common_scanner(scans)
-        if self.calibration is None:
-            if self.head is None or self.head.rig not in RIG_NAMES:
-                raise InputError(f"{self.path}: {HEAD} names no rig of {', '.join(RIG_NAMES)}")
-            self.rig = SensorRig.named(self.head.rig)
-            self._require_rig()
-        else:
-            try:
-                self.rig = self.calibration.rig(self._scanners)
-            except (InputError, SensorError) as error:
-                raise InputError(f"{self.calibration._file or 'calibration'}: {error}") from error
-            at = self.calibration.origin
-            if (at.x, at.y, at.yaw) != (0.0, 0.0, 0.0):
-                turn = math.radians(at.yaw)
-                c, s = math.cos(turn), math.sin(turn)
-                x, y, yaw = poses.T
-                self.poses = np.column_stack([at.x + c * x - s * y, at.y + s * x + c * y, yaw + turn])
+            raise InputError(
+                f"{self.path}: {self._topics['pose']}: pose {bad + 1} is {poses[bad, :3].tolist()}"
+            )
+        at = self.calibration.origin if self.calibration else None
+        if at is not None and (at.x, at.y, at.yaw) != (0.0, 0.0, 0.0):
+            turn = math.radians(at.yaw)
+            c, s = math.cos(turn), math.sin(turn)
+            x, y, yaw = poses.T[:3]
+            poses = np.column_stack([at.x + c * x - s * y, at.y + s * x + c * y, yaw + turn, poses[:, 3:]])
+        self._track = PoseTrack(self._stamps["pose"], poses)
+        self.poses = self._track.poses
         start = self._stamps["pose"][0]
         self.pose_s = (np.array(self._stamps["pose"], np.int64) - start) / 1e9
+        self._scanners = dict.fromkeys(self._setup.clouds, SCANNER)
+        for name, scans in self._measured.items():
+            with naming(f"{self.path}: {self._topics[f'scan:{name}']}"):
+                stamps = self._stamps[f"scan:{name}"]
+                still = [self._without_motion(name, one, at) for one, at in zip(scans, stamps, strict=True)]
+                self._scanners[name], self._scans[name] = common_scanner(still)
+        if self.head is not None and self.calibration is None:
+            self._be_a_survey(self.head)
+        else:
+            self.rig = self._setup.rig(self._scanners)
 
-    def _require_rig(self) -> None:
-        rig = self.rig
-        wanted = {f"scan:{name}" for name, _, _ in rig.lasers}
-        wanted |= {f"image:{name}:mono" for name, _, _ in rig.cameras}
-        wanted |= {f"image:{name}:{side}" for name, _, _ in rig.stereo_cameras for side in ("left", "right")}
+    def _be_a_survey(self, head: Head) -> None:
+        rig = self.rig = SensorRig.named(head.rig)
+        cameras = [(f"image:{name}:mono", camera) for name, camera, _ in rig.cameras]
+        for name, pair, _ in rig.stereo_cameras:
+            cameras += [(f"image:{name}:{side}", pair.camera) for side in ("left", "right")]
+        wanted = {f"scan:{name}" for name, _, _ in rig.lasers} | {key for key, _ in cameras}
         if missing := sorted(wanted - self._topics.keys()):
             raise InputError(f"{self.path}: has no {missing[0].replace(':', ' ')}, which its rig has")
         for name, laser, _ in rig.lasers:
@@ -343,26 +260,78 @@ class RecordedDrive:
                 raise InputError(
                     f"{self.path}: {name} has {self._scanners[name].n_beams} beams, want {laser.n_beams}"
                 )
+        self._setup.pictures = {key: Picture((c.width, c.height), c.matrix, c) for key, c in cameras}
 
-    def _frames(self, every: float) -> list[tuple[int, dict[str, int], FloatArray]]:
-        """Return the stamp, the index of each sensor's part, and the pose of each capture."""
-        others = {key: np.array(s, np.int64) for key, s in self._stamps.items() if key != "pose"}
-        plan: list[tuple[int, dict[str, int], FloatArray]] = []
+    def _without_motion(self, name: str, scan: Scan, stamp: int) -> Scan:
+        """Return a scan as if all its beams were measured at its stamp, the time of the first one."""
+        placed = self._setup.lasers.get(name)
+        if not scan.delay or placed is None or self.pose_at(stamp) is None:
+            return scan
+        beam = np.arange(len(scan.ranges))
+        late = scan.delay * (beam if scan.delay > 0.0 else beam - beam[-1])
+        vehicle = self._track.during(np.concatenate([[0.0], late * 1e9]) + float(stamp))
+        m = placed.mount
+        c, s = np.cos(vehicle[:, 2]), np.sin(vehicle[:, 2])
+        sensor = vehicle + np.column_stack([c * m.x - s * m.y, s * m.x + c * m.y, np.full(len(c), m.yaw)])
+        moved = within(sensor[0], sensor[1:])
+        if np.hypot(*moved.T[:2]).max() < _STILL[0] and np.abs(moved[:, 2]).max() < _STILL[1]:
+            return scan
+        return without_motion(scan, moved)
+
+    def _partners(self, stamp: int) -> dict[str, int] | None:
+        """Return the index of each sensor's message that joins a picture of the first camera; None if one lacks."""
+        found: dict[str, int] = {}
+        for key, stamps in self._arrays.items():
+            beside, most = stamp, CAMERAS_S
+            if key.startswith("scan:"):
+                most = LASER_S
+            elif key.endswith(":right"):
+                left = f"{key.rpartition(':')[0]}:left"
+                beside, most = int(self._arrays[left][found[left]]), PAIR_S
+            found[key] = _nearest(stamps, beside)
+            off = abs(int(stamps[found[key]]) - beside)
+            if off > most * 1e9 or (off > CAMERAS_S * 1e9 and self.pose_at(int(stamps[found[key]])) is None):
+                return None
+        return found
+
+    @property
+    def _arrays(self) -> dict[str, IntArray]:
+        """Stamps of the sensors; the left camera of a pair is before the right one."""
+        if not hasattr(self, "_as_arrays"):
+            keys = sorted(key for key in self._stamps if key not in ("pose", "imu"))
+            self._as_arrays = {key: np.array(self._stamps[key], np.int64) for key in keys}
+        return self._as_arrays
+
+    def _frames(self, every: float) -> list[_Taken]:
+        plan: list[_Taken] = []
         for stamp in self._stamps[self._first]:
-            nearest = {key: _nearest(stamps, stamp) for key, stamps in others.items()}
-            paired = all(abs(int(others[key][i]) - stamp) <= PAIR_S * 1e9 for key, i in nearest.items())
             pose = self.pose_at(stamp)
-            if not paired or pose is None:
+            partners = None if pose is None else self._partners(stamp)
+            if pose is None or partners is None:
                 continue
-            if plan and every > 0.0 and float(np.hypot(*(pose - plan[-1][2])[:2])) < every:
+            if plan and every > 0.0 and float(np.hypot(*(pose - plan[-1].pose)[:2])) < every:
                 continue
-            plan.append((stamp, nearest, pose))
+            plan.append(_Taken(stamp, partners, pose))
         if not plan:
+            self._refuse_pairs()
             raise InputError(
                 f"{self.path}: no picture of {self._topics[self._first]} has a pose and measurements of all "
-                f"other sensors within {PAIR_S} s"
+                f"other sensors: cameras within {CAMERAS_S} s, lasers within {LASER_S} s"
             )
         return plan
+
+    def _refuse_pairs(self) -> None:
+        for key, stamps in self._arrays.items():
+            if key.endswith(":right"):
+                left = self._arrays[f"{key.rpartition(':')[0]}:left"]
+                least = (
+                    min(abs(int(stamps[_nearest(stamps, int(stamp))]) - int(stamp)) for stamp in left) / 1e9
+                )
+                if least > PAIR_S:
+                    raise InputError(
+                        f"{self.path}: no pictures of {self._topics[key]} are of the same moment as those of "
+                        f"{self._topics[f'{key[:-5]}left']}: {least:.4f} s apart at least, want at most {PAIR_S} s"
+                    )
 
     @property
     def _first(self) -> str:
@@ -370,22 +339,30 @@ class RecordedDrive:
 
     def pose_at(self, stamp: int) -> FloatArray | None:
         """Return the interpolated pose, (3,), at a time, ns of Unix time; None where there is none."""
-        stamps = self._stamps["pose"]
-        after = int(np.searchsorted(np.array(stamps, np.int64), stamp))
-        if after < len(stamps) and stamps[after] == stamp:
-            return np.array(self.poses[after], dtype=np.float64)
-        if after in (0, len(stamps)) or stamps[after] - stamps[after - 1] > GAP_S * 1e9:
-            return None
-        one, two = self.poses[after - 1], self.poses[after]
-        share = (stamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
-        turn = (two[2] - one[2] + math.pi) % (2.0 * math.pi) - math.pi
-        return np.array([*(one[:2] + share * (two[:2] - one[:2])), one[2] + share * turn])
+        return self._track.at(stamp)
 
-    def _capture(
-        self, frame: tuple[int, dict[str, int], FloatArray], images: dict[str, NDArray[np.uint8]]
-    ) -> tuple[TimedCapture, FloatArray]:
-        stamp, partners, pose = frame
-        frames = {key: Frame(image, _NO_DEPTH, _NO_DEPTH, _NO_IDS) for key, image in images.items()}
+    def _capture(self, taken: _Taken, parts: dict[str, Any]) -> tuple[TimedCapture, FloatArray]:
+        stamp, partners, pose = taken
+        frames = {
+            key: Frame(image, _NO_DEPTH, _NO_DEPTH, _NO_IDS)
+            for key, image in parts.items()
+            if key.startswith("image:")
+        }
+        scans, tops, moved = {}, {}, {}
+        tilt = self._track.tilt(stamp)
+        for name, _, _ in self.rig.lasers:
+            key = f"scan:{name}"
+            then = int(self._arrays[key][partners[key]])
+            if then != stamp and (where := self._track.moved(then, pose)) is not None:
+                moved[name] = where
+            if name not in self._setup.clouds:
+                scans[name] = self._scans[name][partners[key]]
+                continue
+            cloud: CloudScan = parts[key]
+            scans[name], tops[name] = cloud.ranges, cloud.tops
+            # What the vehicle turned between the two moments comes from the poses.
+            now, before = self._track.tilt(stamp), self._track.tilt(then)
+            tilt = cloud.tilt[0] + now[0] - before[0], cloud.tilt[1] + now[1] - before[1]
         capture = Capture(
             pose,
             {name: frames[f"image:{name}:mono"] for name, _, _ in self.rig.cameras},
@@ -393,25 +370,54 @@ class RecordedDrive:
                 name: StereoFrame(frames[f"image:{name}:left"], frames[f"image:{name}:right"])
                 for name, _, _ in self.rig.stereo_cameras
             },
-            {name: self._scans[name][partners[f"scan:{name}"]] for name, _, _ in self.rig.lasers},
-        )
+            scans, moved, tops, tilt,
+        )  # fmt: skip
         return TimedCapture(self.start + (stamp - self._stamps["pose"][0]) / 1e9, capture), pose
+
+    def _cloud(self, key: str, message: Any, index: int) -> CloudScan:
+        name = key[5:]
+        placed = self._setup.lasers[name]
+        with naming(f"{self.path}: {self._topics[key]}: cloud {index + 1}"):
+            points = placed.in_vehicle(points_of(message))
+            road = fit_road(points) or Road(0.0, 0.0, -placed.mount.z)
+            return scan_of_cloud(points, road)
 
     def _decoded(self, key: str, message: Any, index: int) -> NDArray[np.uint8]:
         where = f"{self.path}: {self._topics[key]}: image {index + 1}"
         image = picture_in(message, where)
         image = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
-        cameras = {name: camera for name, camera, _ in self.rig.cameras}
-        cameras |= {name: pair.camera for name, pair, _ in self.rig.stereo_cameras}
-        camera = cameras[key.split(":")[1]]
-        if image.shape[:2] != (camera.height, camera.width):
+        picture = self._setup.pictures[key]
+        width, height = picture.size
+        if image.shape[:2] != (height, width):
             raise InputError(
-                f"{where} is {image.shape[1]}×{image.shape[0]} px, want {camera.width}×{camera.height} as calibrated"
+                f"{where} is {image.shape[1]}×{image.shape[0]} px, want {width}×{height} as calibrated"
             )
-        lens = self._lenses.get(key)
-        if lens is not None and lens.distortion:
-            image = np.asarray(cv2.undistort(image, camera.matrix, np.array(lens.distortion)))
-        return image
+        return picture.rectified(image)
+
+    def require_near(self, lot: ParkingLot) -> None:
+        """Check that the poses can be in the frame of a lot: that some are at most `FAR_M` away from it."""
+        low, high = lot.slot_xy.min(axis=0), lot.slot_xy.max(axis=0)
+        xy = self.poses[:, :2]
+        away = float(np.hypot(*(np.clip(xy, low, high) - xy).T).min())
+        if away > FAR_M:
+            x, y = xy[0]
+            raise InputError(
+                f"{self.path}: its poses, such as {x:.0f}, {y:.0f}, are {away:,.0f} m away from the lot; want them "
+                "in its frame: `origin` in the calibration, or --origin LAT,LON of its x = y = 0 for poses in degrees"
+            )
+
+
+def _setup_of_survey(types: dict[str, str]) -> DriveSetup:
+    """Return the topics of a recording of `parkenv survey --record`, whose rig its head names."""
+    topics = {"pose": POSE}
+    for topic, kind in types.items():
+        name, _, what = topic[1:].partition("/")
+        if kind == SCAN:
+            topics[f"scan:{name}"] = topic
+        elif kind == COMPRESSED_IMAGE:
+            side = what.partition("/")[0] if what.startswith(("left", "right")) else "mono"
+            topics[f"image:{name}:{side}"] = topic
+    return DriveSetup(topics)
 
 
 def map_drive(
@@ -429,8 +435,7 @@ def map_drive(
     """
     if localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
         raise InputError(f"localise is {localise!r}, want none: {drive.path} has no laser nor stereo camera")
-    errors = drive.photographs.errors if drive.photographs else None
-    mapped = SessionMap(PerceptionPipeline(drive.rig, lot, detector, errors), lot, localise)
+    mapped = SessionMap(PerceptionPipeline(drive.rig, lot, detector, drive.errors), lot, localise)
     shifts, cars = [], []
     for captured, recorded in drive.captures(every):
         result = mapped.add(captured, recorded)
@@ -454,28 +459,6 @@ def _car_rows(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[s
             spread = math.sqrt(np.trace(cars.covariance[k]) / 2.0)
             place |= {"distance_std_m": float(cars.distance_std[k]), "position_std_m": spread}
         yield {name: round(value, 3) if isinstance(value, float) else value for name, value in place.items()}
-
-
-def record_drive(survey: Survey, number: int, path: Path) -> None:
-    with recording(path, survey.pipeline.rig) as writer:
-        driven = survey.drive(
-            number, on_frame=lambda frame: writer.add(frame.result.captured, frame.odometry)
-        )
-        session = driven.session
-        writer.close(Head(**{name: getattr(session, name) for name in ("key", "time", "rig", "weather")}))
-
-
-def _pose_of(message: Any) -> tuple[float, float, float]:
-    if hasattr(message, "theta"):
-        return float(message.x), float(message.y), float(message.theta)
-    pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
-    q, at = pose.orientation, pose.position
-    norm = math.hypot(q.x, q.y, q.z, q.w)
-    if not _NORMS[0] <= norm <= _NORMS[1]:
-        raise InputError(f"its orientation has the norm {norm:.3g}, want a quaternion of norm 1")
-    # The same in any norm.
-    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
-    return float(at.x), float(at.y), yaw
 
 
 def _nearest(stamps: IntArray, stamp: int) -> int:

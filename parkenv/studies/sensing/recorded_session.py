@@ -11,11 +11,12 @@ from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import LocaliserName
 from parkenv.lots.formats.geojson import read_contents
+from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import lot_format
 from parkenv.mapping.drive_calibration import DriveCalibration
+from parkenv.mapping.drive_formats import source_of
 from parkenv.mapping.inference import predict
 from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.photographs import Photographs, is_photographs
 from parkenv.mapping.recorded_drive import RecordedDrive, map_drive
 from parkenv.mapping.store import MapStore
 from parkenv.perception.detector_registry import make_detector
@@ -43,25 +44,30 @@ def add_recording(
     localise: LocaliserName = "none",
     photos: PhotoOptions | None = None,
     lot_file: Path | None = None,
+    names_lot: bool = True,
     progress: Progress = lambda *_: None,
 ) -> Row:
     """Add a recorded drive to the map in a folder, draw the map, and list the located cars (`cars.csv`).
 
-    `recording` is an MCAP file, a rosbag, a folder of photographs or a film; `photos` says of the latter where the
-    poses are, and what the camera is. Without a `calibration` the recording has sensors, mounts and topics. Captures
-    are at least `every` m apart. A lot file in degrees says where poses in degrees are. Return what was found:
-    captures, slots seen and taken, cars, and the errors and largest correction of poses, m.
+    `recording` is what `source_of` reads; `photos` says of photographs or a film where the poses are, and what the
+    camera is. Without a `calibration` the recording has sensors, mounts and topics. Captures are at least `every` m
+    apart. A lot file in degrees says where poses in degrees are; `names_lot`, whether it was chosen for the drive.
+    Return what was found: captures, slots seen and taken, cars, and the errors and largest correction of poses, m.
     """
     finder = make_detector(detector)
     progress("Reading", 0, 0)
-    photos, taken = photos or PhotoOptions(), None
-    if is_photographs(recording):
-        is_geographic = lot_file is not None and lot_format(lot_file) == "native"
-        frame = read_contents(lot_file).frame if lot_file is not None and is_geographic else None
-        taken = Photographs(recording, photos, calibration, frame)
-    elif photos != PhotoOptions():
-        raise InputError(f"{recording}: has poses of its own, want no options of photographs")
-    drive = RecordedDrive(recording, calibration, taken)
+    photos = photos or PhotoOptions()
+    is_geographic = lot_file is not None and lot_format(lot_file) == "native"
+    frame = read_contents(lot_file).frame if lot_file is not None and is_geographic else None
+    if photos.origin is not None:
+        frame = LocalFrame(photos.origin[1], photos.origin[0])
+    source = source_of(recording, calibration, photos, frame)
+    drive = RecordedDrive(recording, calibration, source, frame)
+    if drive.head is None and not names_lot:
+        raise InputError(
+            f"{recording}: was not made by parkenv survey; want --lot FILE with its slots, or --discover to find them"
+        )
+    drive.require_near(scenario.lot)
     make_folder(folder)
     with MapStore(folder / MAP_FILE, scenario.lot) as store:
         require(not store.has(drive.key), f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
@@ -80,12 +86,13 @@ def add_recording(
         "begins": begins,
         "captures": found.frames,
         "pictures_without_pose": drive.without_pose,
+        **({"pictures_without_partner": partly} if (partly := drive.without_partner) else {}),
         "slots": scenario.lot.n_slots,
         "seen": int(states.in_view.sum()),
         "taken": int((states.occupied & states.in_view).sum()),
         "cars_sighted": len(found.session.cars),
         "sighted_in_slots": sum(car["slot"] != "" for car in found.cars),
         "corrected_m": round(found.corrected_m, 3),
-        **({"pose_error_m": round(taken.errors.position, 3)} if taken else {}),
+        **({"pose_error_m": round(drive.errors.position, 3)} if drive.errors else {}),
         **({"distance_std_m": round(float(np.median(std)), 3)} if std else {}),
     }
