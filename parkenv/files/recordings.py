@@ -69,7 +69,7 @@ def open_recording(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
     require_rosbags()
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     _limit_library()
     if path.is_dir():
@@ -79,6 +79,9 @@ def open_recording(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
     is_ros1 = path.suffix == ".bag"
     # Types are those of ROS, not what the file says they are.
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    for name in TRANSFORMS:
+        if name not in store.types:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
     deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
 
     with _in_words(path):

@@ -87,7 +87,7 @@ def set_up(
     ):
         topics["imu"] = imu
     with naming(path):
-        base = found.tree.base(given.base)
+        base = found.tree.base(given.base or found.base(topics["pose"]))
     setup = DriveSetup(topics, tree=found.tree, base=base)
     for laser in chosen.lasers:
         setup.topics[f"scan:{laser.name}"] = laser.topic
@@ -162,9 +162,18 @@ class _Recording:
         if moving and ("map" in self.tree or not fixes):
             return moving[0]
         if not fixes:
-            wanted = ", ".join(kind.rpartition("/")[2] for kind in (*POSES, NAV_FIX, "/tf"))
-            raise InputError(f"{self._path}: has no poses, want {wanted}; it has {listed(self._types)}")
+            wanted = ", ".join(kind.rpartition("/")[2] for kind in (*POSES, NAV_FIX))
+            raise InputError(f"{self._path}: has no poses, want {wanted} or /tf; it has {listed(self._types)}")
         return self.only("satellite receiver", fixes)
+
+    def base(self, pose: str) -> str | None:
+        """Return the frame that poses are of, if they say it and transforms have it."""
+        for _, _, message in islice(self._messages({pose}), 1):
+            frame = getattr(message, "child_frame_id", "")
+            if hasattr(message, "latitude"):
+                frame = message.header.frame_id
+            return frame.strip("/") if frame.strip("/") in self.tree else None
+        return None
 
     def choose(self, given: DriveCalibration) -> DriveCalibration:
         """Return the calibration with the topics that it leaves out, chosen by type where there is one of a kind."""
@@ -183,7 +192,7 @@ class _Recording:
                 for one in lasers
             )
         if not (cameras or pairs):
-            if given._file:
+            if given._file and not self._infos:
                 raise InputError(f"{given._file}: has no camera, want cameras or stereo_cameras")
             self._unplaced.add("camera")
             cameras, pairs = self._cameras(bool(lasers))

@@ -132,7 +132,7 @@ def aligned_pair(
         raise InputError("has fisheye lenses, want pictures that are rectified")
     d = [np.array(one.distortion or (0.0,) * 5, np.float64) for one in (left, right)]
     r1, r2, p1, p2, *_ = cv2.stereoRectify(
-        left.matrix, d[0], right.matrix, d[1], left.size, rotation, translation,
+        left.matrix, d[0], right.matrix, d[1], left.size, rotation, translation.reshape(3, 1),
         flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
     )  # fmt: skip
     baseline = -float(p2[0, 3]) / float(p2[0, 0])

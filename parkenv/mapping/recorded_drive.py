@@ -216,7 +216,8 @@ class RecordedDrive:
             spans[topic] = (stamps[0] / 1e9, stamps[-1] / 1e9)
         low, high = max(s[0] for s in spans.values()), min(s[1] for s in spans.values())
         if low > high + CAMERAS_S:
-            late, early = (t for value, k in ((low, 0), (high, 1)) for t, s in spans.items() if s[k] == value)
+            late = next(topic for topic, span in spans.items() if span[0] == low)
+            early = next(topic for topic, span in spans.items() if span[1] == high)
             raise InputError(
                 f"{self.path}: {early} ends at {high:.3f} s, before {late} begins at {low:.3f} s; want streams that "
                 "overlap in time: do their clocks agree?"
