@@ -1,12 +1,11 @@
 """Folders of drives that a calibration file describes: its topics are names of folders and files in them.
 
 A topic is a folder of pictures, a folder of point clouds, or an .npz file of scans. The time of each is that of the
-pose with the same number of the frame, or of a table `times.csv` in the topic's folder, or the name is the time itself.
+pose with the same number of the frame, or of a table `times.csv` in the topic's folder.
 """
 
 from __future__ import annotations
 
-import re
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
@@ -29,7 +28,6 @@ from parkenv.mapping.photographs import POSES, errors_of_poses, in_metres, pose_
 from parkenv.perception.monocular import RangingErrors
 
 _TIMES = "times.csv"
-_UNIX_DIGITS = re.compile(r"\d{10}(\.\d+)?|\d{19}")  # s or ns of Unix time
 _RANGES = {"ranges": 1.0, "ranges_mm": 0.001}
 
 
@@ -44,7 +42,7 @@ def is_drive_folder(path: Path, calibration: DriveCalibration | None) -> bool:
 
 def _topics(calibration: DriveCalibration) -> list[str]:
     pairs = [topic for pair in calibration.stereo_cameras for topic in (pair.left, pair.right)]
-    single = [one.topic for one in (*calibration.cameras, *calibration.lasers)]
+    single = [one.topic for one in calibration.cameras] + [one.topic for one in calibration.lasers]
     return [topic for topic in (*single, *pairs) if topic]
 
 
@@ -119,43 +117,35 @@ class DriveFolder:
                 stamp = row.get("unix_s", row.get("time"))
                 name = Path(row["file"]).stem if "file" in row else str(int(row.get("frame", -1)))
                 if stamp is None:
-                    raise InputError(
-                        f"{table}: has {', '.join(row)}, want columns file or frame, and time or unix_s"
-                    )
+                    raise InputError(f"{table}: has {', '.join(row)}, want file or frame, and time or unix_s")
                 of[name] = stamp
             return [of.get(name, of.get(_number(name))) for name in names]
-        at = {
-            str(frame): stamp
-            for frame, stamp in zip(self._track.frames, self._track.stamps.tolist(), strict=False)
-        }
-        if not at and self._track.files:
-            at = {
-                Path(file).stem: stamp
-                for file, stamp in zip(self._track.files, self._track.stamps.tolist(), strict=True)
-            }
-        return [at.get(_number(name), at.get(name)) if at else _unix(name) for name in names]
+        track = self._track
+        keys = [str(frame) for frame in track.frames] or [Path(file).stem for file in track.files]
+        at = dict(zip(keys, track.stamps.tolist(), strict=False))
+        return [at.get(_number(name), at.get(name)) for name in names]
 
     def _scans(self, file: Path, key: str) -> list[tuple[int, Any]]:
         arrays = read_arrays(file)
         name = key or next((name for name in _RANGES if name in arrays), "")
         wanted = "frame, angle_min, angle_step and ranges (m), ranges_mm, or `topic = FILE:ARRAY`"
-        if name not in arrays or not arrays.keys() >= {"frame", "angle_min", "angle_step"}:
+        angles = [arrays.get(n, np.empty(0)) for n in ("angle_min", "angle_step")]
+        usable = all(a.size == 1 and np.issubdtype(a.dtype, np.number) for a in angles)
+        if name not in arrays or "frame" not in arrays or not usable:
             raise InputError(f"{file}: has {', '.join(sorted(arrays))}, want {wanted}")
         ranges, frames = arrays[name], arrays["frame"]
         if ranges.ndim != 2 or len(ranges) != frames.size or not np.issubdtype(ranges.dtype, np.number):
             raise InputError(f"{file}: {name} has the shape {ranges.shape}, want {frames.size} rows")
         scale = 0.001 if np.issubdtype(ranges.dtype, np.integer) else _RANGES.get(name, 1.0)
         metres = (ranges * scale).astype(np.float32)
-        most = float(
-            arrays.get("range_max", np.nanmax(np.where(np.isfinite(metres), metres, 0.0), initial=0.0) + 0.01)
-        )
-        numbers = {n: float(arrays[n]) for n in ("angle_min", "angle_step")}
+        start, step = (float(a.item()) for a in angles)
+        most = float(np.where(np.isfinite(metres), metres, 0.0).max(initial=0.0)) + 0.01
         stamps = self._stamps(file, [str(frame) for frame in frames.ravel().tolist()])
 
         def scan(row: int, stamp: int) -> Any:
             return SimpleNamespace(
-                header=header(stamp, file.name), ranges=metres[row], angle_min=numbers["angle_min"],
-                angle_increment=numbers["angle_step"], range_min=0.0, range_max=most, time_increment=0.0,
+                header=header(stamp, file.name), ranges=metres[row], angle_min=start, angle_increment=step,
+                range_min=0.0, range_max=most,
             )  # fmt: skip
 
         return [(stamp, partial(scan, row, stamp)) for row, stamp in enumerate(stamps) if stamp is not None]
@@ -163,13 +153,3 @@ class DriveFolder:
 
 def _number(name: str) -> str:
     return str(int(name)) if name.isdecimal() else name
-
-
-def _unix(name: str) -> int | None:
-    """Return the time, ns, that a name is, of s or ns of Unix time."""
-    if not _UNIX_DIGITS.fullmatch(name):
-        return None
-    seconds, _, fraction = name.partition(".")
-    return (
-        int(name) if len(name) == 19 and not fraction else int(seconds) * 10**9 + int(f"{fraction:0<9}"[:9])
-    )

@@ -64,36 +64,28 @@ class DriveSetup:
         return SensorRig(tuple(self.cameras), tuple(self.stereo_cameras), tuple(lasers))
 
 
-def listed(types: dict[str, str], topics: Iterable[str] | None = None) -> str:
-    there = sorted(types if topics is None else topics)
-    return ", ".join(f"{topic} ({types[topic]})" for topic in there[:_LISTED]) or "nothing"
-
-
 def set_up(
     path: Path, calibration: DriveCalibration | None, types: dict[str, str], messages: Messages
 ) -> DriveSetup:
     """Return the sensors; topics, lenses and mounts that the calibration leaves out are those of the recording."""
     found = _Recording(path, types, messages)
     if calibration is None and not found.of(CAMERA_INFO):
-        raise InputError(
-            f"{path}: was not made by parkenv survey --record, and has no CameraInfo; describe its sensors: --calibration"
-        )
+        what = "was not made by parkenv survey --record, and has no CameraInfo"
+        raise found.error(f"{what}; describe its sensors: --calibration")
     given = calibration or DriveCalibration()
-    place = given._file or "calibration"
     chosen = found.choose(given)
     topics = {"pose": found.pose(given)}
-    if types.get(topics["pose"]) == NAV_FIX and (
-        imu := given.imu or found.only("imu", found.of(IMU), optional=True)
-    ):
+    imu = given.imu or "".join(found.of(IMU)[:1])
+    if imu and types.get(topics["pose"]) == NAV_FIX:
         topics["imu"] = imu
     with naming(path):
         base = found.tree.base(given.base or found.base(topics["pose"]))
     setup = DriveSetup(topics, tree=found.tree, base=base)
-    for laser in chosen.lasers:
-        setup.topics[f"scan:{laser.name}"] = laser.topic
-    for key, topic in _image_topics(chosen).items():
-        setup.topics[key] = topic
-    found.require(setup.topics)
+    topics |= {f"scan:{laser.name}": laser.topic for laser in chosen.lasers}
+    topics |= {f"image:{camera.name}:mono": camera.topic for camera in chosen.cameras}
+    for pair in chosen.stereo_cameras:
+        topics |= {f"image:{pair.name}:left": pair.left, f"image:{pair.name}:right": pair.right}
+    found.require(topics)
     try:
         found.place_lasers(setup, chosen)
         for camera in chosen.cameras:
@@ -103,15 +95,8 @@ def set_up(
     except (InputError, SensorError) as error:
         if calibration is None or str(error).startswith(str(path)):
             raise InputError(str(error)) from error
-        raise InputError(f"{place}: {error}") from error
+        raise InputError(f"{given._file or 'calibration'}: {error}") from error
     return setup
-
-
-def _image_topics(calibration: DriveCalibration) -> dict[str, str]:
-    topics = {f"image:{camera.name}:mono": camera.topic for camera in calibration.cameras}
-    for pair in calibration.stereo_cameras:
-        topics |= {f"image:{pair.name}:left": pair.left, f"image:{pair.name}:right": pair.right}
-    return topics
 
 
 class _Recording:
@@ -134,13 +119,19 @@ class _Recording:
     def of(self, *kinds: str) -> list[str]:
         return [topic for topic, kind in sorted(self._types.items()) if kind in kinds]
 
-    def only(self, what: str, topics: list[str], *, optional: bool = False) -> str:
-        if len(topics) == 1 or (optional and not topics):
-            return topics[0] if topics else ""
-        there = listed(self._types, topics or None)
+    def error(self, text: str) -> InputError:
+        return InputError(f"{self._path}: {text}")
+
+    def listed(self, topics: Iterable[str] = ()) -> str:
+        there = [f"{topic} ({self._types[topic]})" for topic in sorted(topics or self._types)]
+        return ", ".join(there[:_LISTED]) or "nothing"
+
+    def only(self, what: str, topics: list[str]) -> str:
         if not topics:
-            raise InputError(f"{self._path}: has no {what}; it has {there}")
-        raise InputError(f"{self._path}: has {len(topics)} {what}s, {there}; {_HOW}")
+            raise self.error(f"has no {what}; it has {self.listed()}")
+        if len(topics) > 1:
+            raise self.error(f"has {len(topics)} {what}s, {self.listed(topics)}; {_HOW}")
+        return topics[0]
 
     def require(self, topics: dict[str, str]) -> None:
         for key, topic in topics.items():
@@ -148,22 +139,20 @@ class _Recording:
             kinds = {"pose": (*POSES, NAV_FIX, *TRANSFORMS), "imu": (IMU,)}.get(kind) or SENSORS[kind]
             if self._types.get(topic) not in kinds:
                 wanted = " or ".join(kinds)
-                raise InputError(
-                    f"{self._path}: has no {kind}s in {topic}, want {wanted}; it has {listed(self._types)}"
-                )
+                raise self.error(f"has no {kind}s in {topic}, want {wanted}; it has {self.listed()}")
 
     def pose(self, given: DriveCalibration) -> str:
         """Return the topic of the poses: as named, else by its type."""
         if "pose" in given.model_fields_set or given.pose in self._types:
             return given.pose
         if topics := self.of(*POSES):
-            return self.only("topic of poses", topics).strip()
+            return self.only("topic of poses", topics)
         fixes, moving = self.of(NAV_FIX), [t for t in self.of(*TRANSFORMS) if "static" not in t]
         if moving and ("map" in self.tree or not fixes):
             return moving[0]
         if not fixes:
             wanted = ", ".join(kind.rpartition("/")[2] for kind in (*POSES, NAV_FIX))
-            raise InputError(f"{self._path}: has no poses, want {wanted} or /tf; it has {listed(self._types)}")
+            raise self.error(f"has no poses, want {wanted} or /tf; it has {self.listed()}")
         return self.only("satellite receiver", fixes)
 
     def base(self, pose: str) -> str | None:
@@ -180,17 +169,13 @@ class _Recording:
         lasers, cameras, pairs = given.lasers, given.cameras, given.stereo_cameras
         if not (cameras or pairs or lasers):
             self._unplaced.add("laser")
-            if cloud := self.only("cloud", self.of(CLOUD), optional=True):
-                lasers = (LaserSpec(name="laser", topic=cloud),)
-            elif scan := self.only("laser", self.of(SCAN), optional=True):
-                lasers = (LaserSpec(name="laser", topic=scan),)
-        else:
-            lasers = tuple(
-                one
-                if one.topic
-                else one.model_copy(update={"topic": self.only("laser", self.of(SCAN, CLOUD))})
-                for one in lasers
-            )
+            if measured := self.of(CLOUD) or self.of(SCAN):
+                lasers = (LaserSpec(name="laser", topic=self.only("laser", measured)),)
+        lasers = tuple(
+            one if one.topic
+            else one.model_copy(update={"topic": self.only("laser", self.of(SCAN, CLOUD))})
+            for one in lasers
+        )  # fmt: skip
         if not (cameras or pairs):
             if given._file and not self._infos:
                 raise InputError(f"{given._file}: has no camera, want cameras or stereo_cameras")
@@ -206,9 +191,7 @@ class _Recording:
             if not (pair.left and pair.right):
                 (left, right), *_ = [*self._pairs(), ("", "")]
                 if not left or len(self._pairs()) > 1:
-                    raise InputError(
-                        f"{self._path}: {pair.name}: want `left` and `right`; it has {listed(self._types)}"
-                    )
+                    raise self.error(f"{pair.name}: want `left` and `right`; it has {self.listed()}")
                 pair = pair.model_copy(update={"left": left, "right": right})
             whole.append(pair)
         return given.model_copy(
@@ -218,11 +201,7 @@ class _Recording:
     def _pictures(self) -> list[str]:
         """Return the topics of pictures, one of those of the same pictures."""
         topics = [topic for topic in self.of(*SENSORS["image"]) if not _NO_PICTURES.search(topic)]
-        return [
-            topic
-            for topic in topics
-            if topic.removesuffix("/compressed") == topic or topic[:-11] not in topics
-        ]
+        return [topic for topic in topics if topic.removesuffix("/compressed") not in {*topics} - {topic}]
 
     def _pairs(self) -> list[tuple[str, str]]:
         topics = self._pictures()
@@ -258,17 +237,13 @@ class _Recording:
 
     def _place(self, setup: DriveSetup, spec: SizedLens | LaserSpec, topic: str) -> Placed:
         """Return where a sensor is: as the file says, else by the frames, else the usual place of a named sensor."""
-        frame = (
-            self._frame(topic) if setup.base is not None and "mount" not in spec.model_fields_set else None
-        )
+        frame = self._frame(topic) if setup.base and "mount" not in spec.model_fields_set else None
         at = self.tree.between(setup.base, frame) if frame and setup.base else None
         if at is not None:
             axes = at[:3, :3] if isinstance(spec, LaserSpec) else camera_axes(at[:3, :3])
             return Placed.of(at[:3, 3], axes)._replace(frame_z=float(at[2, 3]))
         if spec.name in self._unplaced:
-            raise InputError(
-                f"{self._path}: /tf does not say where {topic} is on the vehicle; describe its mount: --calibration"
-            )
+            raise self.error(f"/tf does not say where {topic} is on the vehicle; describe it: --calibration")
         return spec.mount.placed()
 
     def place_lasers(self, setup: DriveSetup, calibration: DriveCalibration) -> None:
@@ -281,13 +256,10 @@ class _Recording:
                 if placed.frame_z is not None and self._base_height is None:
                     heights += [z - placed.frame_z for z in self._heights(spec.topic, placed)]
             elif abs(np.cos(placed.roll)) < np.cos(np.radians(20.0)):
-                raise InputError(
-                    f"{self._path}: {spec.topic}: is rolled by {np.degrees(placed.roll):.0f}°, want 0 or 180"
-                )
+                raise self.error(f"{spec.topic}: is rolled by {np.degrees(placed.roll):.0f}°, want 0 or 180")
             setup.lasers[spec.name] = placed
         if self._base_height is None:
-            measured = float(np.median(heights)) if heights else None
-            self._base_height = measured if measured is not None else self.tree.height(setup.base or "")
+            self._base_height = float(np.median(heights)) if heights else self.tree.height(setup.base or "")
         for name, placed in setup.lasers.items():
             setup.lasers[name] = self._raised(placed, setup.topics[f"scan:{name}"])
 
@@ -305,8 +277,8 @@ class _Recording:
             return placed
         height = placed.frame_z + (self._base_height or 0.0)
         if height < _LEAST_HEIGHT_M:
-            raise InputError(
-                f"{self._path}: {topic} is {height:.2f} m above the road by /tf, want `base_height` in a calibration"
+            raise self.error(
+                f"/tf has {topic} {height:.2f} m above the road; want `base_height` in --calibration"
             )
         m = placed.mount
         return placed._replace(mount=Mount(m.x, m.y, height, m.yaw, m.pitch))
@@ -334,9 +306,8 @@ class _Recording:
             left, right, baseline = aligned_pair(left, own, other.matrix, turned)
             turn = left.rotation
         elif any(spec.distortion):
-            raise InputError(
-                f"{spec.name}: has distortion, want the numbers of its right_camera, too, or rectified pictures"
-            )
+            wanted = "the numbers of its right_camera, too, or rectified pictures"
+            raise InputError(f"{spec.name}: has distortion, want {wanted}")
         if baseline is None:
             raise InputError(f"{spec.name}: baseline is missing, want the distance of its cameras, m")
         placed = self._raised(self._place(setup, spec, topics[0]), topics[0]).turned(turn)
@@ -351,34 +322,26 @@ class _Recording:
             return own, np.eye(3)
         info = self._info(topic)
         if info is None:
-            raise InputError(
-                f"{self._path}: {topic} has no CameraInfo; want width, height, fx, fy, cx and cy of {spec.name} in a "
-                "calibration file (--calibration)"
-            )
+            wanted = f"width, height, fx, fy, cx and cy of {spec.name} in a calibration file (--calibration)"
+            raise self.error(f"{topic} has no CameraInfo; want {wanted}")
         with naming(f"{self._path}: {topic}"):
             return info.picture(topic, aligned)
 
     def _baseline(self, topics: list[str]) -> float | None:
         """Return the distance of two cameras, m: as their projections say, of which the first may be off zero, too."""
-        infos = [self._info(topic) for topic in topics]
-        if infos[0] is None or infos[1] is None:
+        left, right = (self._info(topic) for topic in topics)
+        if left is None or right is None:
             return None
-        shift = [info.projection[0, 3] / info.projection[0, 0] for info in infos if info is not None]
-        baseline = float(shift[0] - shift[1])
-        if baseline <= 0.0:
-            frames = [info.frame for info in infos if info is not None]
-            at = self.tree.between(frames[0], frames[1])
-            baseline = 0.0 if at is None else float(np.linalg.norm(at[:3, 3]))
-        return baseline or None
+        off = [info.projection[0, 3] / info.projection[0, 0] for info in (left, right)]
+        at = self.tree.between(left.frame, right.frame)
+        between = 0.0 if at is None else float(np.linalg.norm(at[:3, 3]))
+        return float(off[0] - off[1]) if off[0] > off[1] else between or None
 
 
 def _right_of(topic: str) -> list[str]:
     """Return what the right camera of a pair may be called, whose left one has a topic."""
-    names = [
-        topic.replace(left, right)
-        for left, right in (("left", "right"), ("infra1", "infra2"))
-        if left in topic
-    ]
+    sides = ("left", "right"), ("infra1", "infra2")
+    names = [topic.replace(left, right) for left, right in sides if left in topic]
     for digit in re.finditer(r"(?<!\d)0*[02468](?!\d)", topic):
         number = f"{int(digit[0]) + 1:0{len(digit[0])}d}"
         names.append(f"{topic[: digit.start()]}{number}{topic[digit.end() :]}")

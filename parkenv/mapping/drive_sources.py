@@ -51,8 +51,8 @@ class Bag:
         return open_recording(self.path)
 
 
-Stream = tuple[str, list[tuple[int, Callable[[], Any]]]]
-"""The type of a topic's messages, and the time of each, ns, with what makes it."""
+Timed = list[tuple[int, Callable[[], Any]]]  # times of messages, ns, each with what makes it
+Stream = tuple[str, Timed]  # the type of a topic's messages, and they
 CLOUD_SUFFIXES = (".npz", ".bin", ".txt")
 
 

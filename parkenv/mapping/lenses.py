@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -38,13 +39,21 @@ class Picture:
     fisheye: bool = False
     rotation: FloatArray = field(default_factory=lambda: np.eye(3))
 
+    @property
+    def coefficients(self) -> FloatArray:
+        """The distortion, with zeros to one of the lengths that OpenCV takes."""
+        n = len(self.distortion)
+        return np.pad(
+            np.array(self.distortion, np.float64), (0, next(m for m in (5, 8, 12, 14) if m >= n) - n)
+        )
+
     @cached_property
     def _maps(self) -> tuple[NDArray[Any], NDArray[Any]] | None:
         new = self.camera
         same = self.size == (new.width, new.height) and np.array_equal(self.matrix, new.matrix)
         if same and not any(self.distortion) and np.array_equal(self.rotation, np.eye(3)):
             return None
-        size, d = (new.width, new.height), np.array(self.distortion, np.float64)
+        size, d = (new.width, new.height), self.coefficients
         if self.fisheye:
             return cv2.fisheye.initUndistortRectifyMap(
                 self.matrix, d[:4], self.rotation, new.matrix, size, cv2.CV_16SC2
@@ -86,7 +95,11 @@ class Info(NamedTuple):
         )
         size = int(message.width), int(message.height)
         if not (
-            k.size == 9 and r.size == 9 and p.size == 12 and all(np.isfinite(a).all() for a in (k, d, r, p))
+            k.size == 9
+            and d.size <= 14
+            and r.size == 9
+            and p.size == 12
+            and all(np.isfinite(a).all() for a in (k, d, r, p))
         ):
             raise InputError("has numbers that are missing or not finite, want k, d, r and p")
         if not (min(size) > 0 and k[0] > 0.0 and k[4] > 0.0):
@@ -102,7 +115,7 @@ class Info(NamedTuple):
 
     def is_rectified(self, topic: str) -> bool:
         """Whether pictures of a topic are, as its name or the principal points say: `kitti2bag` calls them raw."""
-        if "rect" in topic.lower():
+        if re.search(r"(?i)(?:\b|_)rect", topic):
             return True
         off = [np.abs(m[:2, 2] / self.size - 0.5).max() for m in (self.matrix, self.projection)]
         return bool(off[0] > _OFF_CENTRE > off[1])
@@ -130,9 +143,9 @@ def aligned_pair(
     """
     if left.fisheye or right.fisheye:
         raise InputError("has fisheye lenses, want pictures that are rectified")
-    d = [np.array(one.distortion or (0.0,) * 5, np.float64) for one in (left, right)]
     r1, r2, p1, p2, *_ = cv2.stereoRectify(
-        left.matrix, d[0], right.matrix, d[1], left.size, rotation, translation.reshape(3, 1),
+        left.matrix, left.coefficients, right.matrix, right.coefficients, left.size,
+        rotation, translation.reshape(3, 1),
         flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
     )  # fmt: skip
     baseline = -float(p2[0, 3]) / float(p2[0, 0])
