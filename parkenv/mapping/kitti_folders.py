@@ -264,4 +264,4 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 def _shift_of(projection: FloatArray) -> FloatArray:
     """Return what takes points from the first camera's frame to that of a projection, (4, 4)."""
     p = projection.reshape(3, 4)
-    return _matrix(np.eye(3), np.linalg.solve(p[:, :3], p[:, 3]))
+    return _matrix(np.eye(3), np.asarray(np.linalg.solve(p[:, :3], p[:, 3]), dtype=np.float64))
