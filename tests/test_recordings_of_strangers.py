@@ -1,6 +1,7 @@
 """Recordings that nobody here made: bags that describe themselves, KITTI's folders, plain folders, and their faults."""
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,9 +10,11 @@ from command_line import parkenv
 from scipy.spatial.transform import Rotation
 
 from parkenv import InputError
+from parkenv.files.recordings import IMAGE, POSES, SCAN
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.drive_formats import source_of
+from parkenv.mapping.drive_setup import set_up
 from parkenv.mapping.laser_scans import Scan, mirrored, without_motion
 from parkenv.mapping.lenses import Picture, Placed, aligned_pair
 from parkenv.mapping.photo_options import PhotoOptions
@@ -230,7 +233,10 @@ def test_transforms_pairs_and_hanging_sensors(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"skip": ("/fix", "/imu")}, "has no poses, want Pose2D, .*NavSatFix or /tf; it has /left/camera_info"),
+        (
+            {"skip": ("/fix", "/imu")},
+            "has no poses, want Pose2D, .*NavSatFix or /tf; it has /left/camera_info",
+        ),
         ({"skip": ("/left/camera_info",)}, "has no CameraInfo; describe its sensors: --calibration"),
         (
             {"sides": ("front", "rear")},
@@ -355,7 +361,8 @@ def kitti(folder, rectified=True):
 
     cameras = {}
     for k in range(2):
-        cameras |= {f"S_0{k}": [WIDTH + 20.0, HEIGHT + 12.0], f"S_rect_0{k}": [WIDTH + 0.0, HEIGHT + 0.0], f"R_rect_0{k}": np.eye(3),
+        cameras |= {f"S_0{k}": [WIDTH + 20.0, HEIGHT + 12.0], f"S_rect_0{k}": [float(WIDTH), float(HEIGHT)],
+                    f"R_rect_0{k}": np.eye(3),
                     f"K_0{k}": [60.0, 0, 58, 0, 60, 22, 0, 0, 1], f"D_0{k}": [-0.1, 0, 0, 0, 0],
                     f"P_rect_0{k}": [F, 0, 48, -F * 0.54 * k, 0, F, 16, 0, 0, 0, 1, 0]}  # fmt: skip
     (day / "calib_cam_to_cam.txt").write_text(lines(**cameras))
@@ -463,3 +470,18 @@ def test_a_folder_of_a_drive_and_its_calibration_file(tmp_path):
         InputError, match=r"car\.toml: front: has distortion, want the numbers of its right_camera"
     ):
         read(pair.replace('topic = "left"', 'left = "left"\nright = "left"'))
+
+
+def test_the_calibrations_of_the_page_are_read(tmp_path):
+    page = (Path(__file__).parents[1] / "docs/calibration.md").read_text(encoding="utf-8")
+    examples = [part.split("```")[0] for part in page.split("```toml\n")[1:]]
+    for text in examples:
+        (tmp_path / "car.toml").write_text(text)
+        calibration = DriveCalibration.read(tmp_path / "car.toml")
+        for lens in (*calibration.cameras, *calibration.stereo_cameras):
+            assert lens.picture(lens.width, lens.height) is not None
+    assert len(examples) == 2
+    topics = {"/camera/image_raw": IMAGE, "/scan": SCAN, "/odom": POSES[-1]}
+    (tmp_path / "car.toml").write_text(examples[0])
+    setup = set_up(tmp_path, DriveCalibration.read(tmp_path / "car.toml"), topics, lambda _: iter(()))
+    assert setup.rig({"front": SCANNER}).cameras[0][2] == Mount(0.4, 0.0, 1.3, -math.pi / 2)
