@@ -76,9 +76,11 @@ class Capture:
         pose: (3,) float64, x, y in m and yaw in rad of the vehicle, world frame.
         images: frame of each camera by name; a frame also contains the true depth and instance ids.
         pairs: frames of each stereo camera by name.
-        scans: ranges of each laser by name, (n_beams,) float32, m, `inf` for no return.
+        scans: ranges of each laser by name, (n_beams,) float32, m, `inf` for no return, NaN where
+            it is not known.
         moved: for lasers that measured at another moment than the cameras: (3,) x, y, yaw of the vehicle then, in its
             frame when the pictures were taken.
+        again: lasers whose scan another capture, nearer in time, has too.
         tops: for lasers of several layers: (n_beams,) float32, m, height above the ground of the highest return of what
             each beam meets; NaN where it is not known.
         tilt: roll (to the right) and pitch (upwards) of the vehicle against the road, rad.
@@ -89,8 +91,16 @@ class Capture:
     pairs: dict[str, StereoFrame]
     scans: dict[str, NDArray[np.float32]]
     moved: dict[str, FloatArray] = field(default_factory=dict)
+    again: frozenset[str] = frozenset()
     tops: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     tilt: tuple[float, float] = (0.0, 0.0)
+
+    def vehicle_at(self, laser: str, vehicle: FloatArray) -> FloatArray:
+        """Return the pose of the vehicle when a laser measured, (3,), for its pose when the pictures were taken."""
+        if laser not in self.moved:
+            return vehicle
+        x, y, yaw = self.moved[laser].tolist()
+        return np.array(Mount(x, y, yaw=yaw).in_world(vehicle))
 
 
 class TimedCapture(NamedTuple):

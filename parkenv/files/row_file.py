@@ -4,7 +4,7 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
@@ -40,6 +40,7 @@ class RowFile:
         alone: whether no other process opens it meanwhile: each transaction is fast, and its rows survive the end of
             this process, but only those of the second before that of the machine.
         about: what the head of a new file also says.
+        views: statements that make views of a new file's rows, for people with SQL; none is read here.
     """
 
     def __init__(
@@ -51,7 +52,9 @@ class RowFile:
         create: bool = True,
         alone: bool = False,
         about: Row | None = None,
+        views: Sequence[str] = (),
     ) -> None:
+        self._views = views
         self.what, self.made_by, self._alone, self._synced = what, made_by, alone and create, 0.0
         self.head: Row = {"what": what, **(about or {})}
         self.path = path
@@ -172,7 +175,8 @@ class RowFile:
             with self._transaction("IMMEDIATE"):
                 # Another process may have been faster.
                 if self._is_empty():
-                    self._db.execute(_TABLE)
+                    for statement in (_TABLE, *self._views):
+                        self._db.execute(statement)
                     self._insert([(_HEAD, "", self.head)])
                     self._db.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
                     self._db.execute(f"PRAGMA user_version = {_VERSION}")

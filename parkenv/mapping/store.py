@@ -59,6 +59,12 @@ class Session:
             )
 
 
+# What sessions saw, for people with SQL: SELECT slot, p_occupied FROM sighting.
+_SIGHTINGS = """CREATE VIEW sighting AS
+SELECT json_extract(row.key, '$') AS session, each.key AS slot, each.value AS p_occupied
+FROM row, json_each(row.value, '$.p_occupied') AS each WHERE row.name = 'session' AND each.value IS NOT NULL"""
+
+
 class MapStore:
     """A map file.
 
@@ -77,7 +83,7 @@ class MapStore:
         # Adding 0 turns -0.0 into 0.0.
         digest = hashlib.sha256((np.round(poses, 3) + 0.0).tobytes()).hexdigest()[:16]
         about = {"lot": lot.name, "digest": digest}
-        self._file = RowFile(path, "map file", "parkenv survey", create=create, about=about)
+        self._file = RowFile(path, "map file", "parkenv survey", create=create, about=about, views=[_SIGHTINGS])
         head = self._file.head
         if head.get("digest") != about["digest"]:
             self.close()
@@ -106,7 +112,8 @@ class MapStore:
             InputError: a session with this key exists, the number of slots is wrong, or the file cannot be written.
         """
         self._require_slots(session)
-        self._file.add("session", session.key, vars(session))
+        known = [None if math.isnan(p) else p for p in session.p_occupied.tolist()]  # JSON has no NaN
+        self._file.add("session", session.key, vars(session) | {"p_occupied": known})
 
     def sessions(self) -> list[Session]:
         """Return all sessions, ordered by key.

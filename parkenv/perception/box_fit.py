@@ -52,7 +52,7 @@ def fit_box(
     """
     if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not np.isfinite(points).all():
         raise InputError(f"points have shape {points.shape}, want (at least 1, 2) finite numbers")
-    theta = float(_direction(np.ascontiguousarray(points, dtype=np.float64)))
+    theta = direction_of(points)
     axis = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
     local, seen_from = points @ axis.T, axis @ sensor
     low, high = local.min(axis=0), local.max(axis=0)
@@ -82,6 +82,11 @@ def fit_box(
         float(extent[along]),
         float(extent[1 - along]),
     )
+
+
+def direction_of(points: FloatArray) -> float:
+    """Return the direction, rad in [0, π/2), of the rectangle closest to points, (k, 2) m, on its sides."""
+    return float(_direction(np.ascontiguousarray(points, dtype=np.float64)))
 
 
 @compiled

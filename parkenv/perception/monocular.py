@@ -185,8 +185,10 @@ def localize_boxes(
     sure = detections.probability >= PROBABILITY
     margin = MARGIN * camera.width + 2.0 * errors.detector.std[0] * (boxes[:, 3] - boxes[:, 1])
     cut_left, cut_right = boxes[:, 0] <= margin, boxes[:, 2] >= camera.width - margin
-    sure &= ~(cut_left & cut_right)
-    rows = np.flatnonzero(sure & agree & (ahead > _NEAREST) & (ahead < REACH) & ~_is_hidden(boxes))
+    whole = ~(cut_left & cut_right)
+    rows = np.flatnonzero(
+        sure & whole & agree & (ahead > _NEAREST) & (ahead < REACH) & ~_is_hidden(boxes, sure)
+    )
     boxes, ahead, std, view = boxes[rows], ahead[rows], std[rows], detections.view[rows]
     usual = UsualCars.seen_as(view)
     left, right = (ground.aside(boxes[:, side], boxes[:, 3]) for side in (0, 2))
@@ -236,9 +238,10 @@ def corners_of_cars(heading: FloatArray) -> tuple[FloatArray, FloatArray]:
     return c * length - s * width, -s * length - c * width
 
 
-def _is_hidden(boxes: FloatArray) -> BoolArray:
+def _is_hidden(boxes: FloatArray, sure: BoolArray) -> BoolArray:
+    """Return which boxes' lower edge nearer ones hide, of those that are `sure` to show cars."""
     common = np.minimum(boxes[:, None, 2], boxes[:, 2]) - np.maximum(boxes[:, None, 0], boxes[:, 0])
     lower = boxes[:, 3] > boxes[:, None, 3]
     above = boxes[:, 1] < boxes[:, None, 3]
-    hidden = np.where(lower & above, common, 0.0).max(axis=1)
+    hidden = np.where(lower & above & sure, common, 0.0).max(axis=1)
     return np.asarray(hidden > _HIDDEN * (boxes[:, 2] - boxes[:, 0]))

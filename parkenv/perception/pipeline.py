@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.perception.detector import (
     PROBABILITY,
     BandDetector,
@@ -52,6 +52,7 @@ class CameraView:
         stereo: without a laser, the stereo camera and its disparity, (h, w) float32 px; else None.
         cars: the detections that could be located.
         slots: (n,) int64, the slot that each of `cars` stands in; -1 for none.
+        hiding: without a ranging sensor, (k, 4) px, all boxes, however unlikely, behind which slots are not seen.
     """
 
     name: str
@@ -63,6 +64,7 @@ class CameraView:
     stereo: tuple[StereoCamera, NDArray[np.float32]] | None
     cars: LocatedCars
     slots: NDArray[np.int64]
+    hiding: FloatArray | None = None
 
 
 class _Seen(NamedTuple):
@@ -75,7 +77,7 @@ class PerceptionResult:
     captured: TimedCapture  # the capture and its time
     vehicle: FloatArray  # (3,) estimated x, y in m and yaw in rad of the vehicle, world frame
     views: tuple[CameraView, ...]  # one for each camera and stereo camera of the rig
-    scans: tuple[RangeScan, ...]  # one for each laser and stereo camera of the rig
+    scans: tuple[RangeScan, ...]  # one for each laser and stereo camera of the rig that has measured anew
 
     @property
     def n_cars(self) -> int:
@@ -90,7 +92,7 @@ class PerceptionPipeline:
 
     Args:
         rig: with at least one camera or stereo camera.
-        lot: the lot with the slots.
+        lot: the lot with the slots; None: cars are located only.
         detector: a detector, or its name (see `make_detector`); None: the packaged HOG detector.
         errors: of poses and mount, where distances follow from boxes; those of the boxes are the detector's own.
 
@@ -101,7 +103,7 @@ class PerceptionPipeline:
     def __init__(
         self,
         rig: SensorRig,
-        lot: ParkingLot,
+        lot: ParkingLot | None,
         detector: str | Detector | None = None,
         errors: RangingErrors | None = None,
     ) -> None:
@@ -129,14 +131,23 @@ class PerceptionPipeline:
             vehicle: (3,) estimated x, y, yaw of the vehicle, or a function that estimates it from the scans in the
                 vehicle's frame; None: the true pose.
         """
-        return self._process(captured, self._look(captured), slots, vehicle)
+        return self.update_slots(slots, self.locate(captured, vehicle, slots.headings_near))
 
-    def _process(
+    def locate(
+        self,
+        captured: TimedCapture,
+        vehicle: FloatArray | Callable[[Sequence[RangeScan]], FloatArray] | None = None,
+        headings_near: Callable[[FloatArray], FloatArray] | None = None,
+    ) -> PerceptionResult:
+        """Find and locate the cars of one capture, without slots; see `process` and `localize_boxes`."""
+        return self._locate(captured, self._look(captured), vehicle, headings_near)
+
+    def _locate(
         self,
         captured: TimedCapture,
         seen: _Seen,
-        slots: SlotFilter,
-        vehicle: FloatArray | Callable[[Sequence[RangeScan]], FloatArray] | None = None,
+        vehicle: FloatArray | Callable[[Sequence[RangeScan]], FloatArray] | None,
+        headings_near: Callable[[FloatArray], FloatArray] | None,
     ) -> PerceptionResult:
         vehicle = captured.capture.pose if vehicle is None else vehicle
         views = []
@@ -145,28 +156,42 @@ class PerceptionPipeline:
         if callable(vehicle):
             vehicle = vehicle(tuple(scans.values()))
             scans = {name: scan.placed(vehicle) for name, scan in scans.items()}
-        for scan in scans.values():
-            slots.update_from_scan(scan)  # T §3.3.2, from beams
         sensors = [name for name, *_ in self.rig.lasers or self.rig.stereo_cameras]
         for name, camera, mount, image in self._images(captured.capture):
             detections = seen.detections[name]
+            hiding = None
             if scans:
                 scan = scans[name if name in sensors else sensors[0]]
+                scan = scan.seen_from(*mount.in_world(vehicle)[:2])
                 cars = localize_cars(detections, scan, camera, mount, vehicle)  # eq. 3.2
             else:
                 x, y, _ = mount.in_world(vehicle)
                 scan, ground = RangeScan(x, y, np.empty(0), np.empty(0), 0.0), GroundView(camera, mount)
-                cars = localize_boxes(detections, ground, vehicle, self.errors, slots.headings_near)
-                boxes = self.errors.detector.corrected(detections.boxes)
-                slots.update_from_picture(ground, vehicle, boxes, self.errors)
+                cars = localize_boxes(detections, ground, vehicle, self.errors, headings_near)
+                hiding = self.errors.detector.corrected(detections.boxes)
             confirmed = detections.probability >= PROBABILITY
             confirmed[cars.detection] = True
             cars = dataclasses.replace(cars, detection=np.cumsum(confirmed)[cars.detection] - 1)
             detections = detections.select(confirmed)
-            placed = slots.update_from_cars(cars)  # T §3.3.2, from detections
             stereo = None if self.rig.lasers else seen.disparities.get(name)
-            views.append(CameraView(name, camera, mount, image, detections, scan, stereo, cars, placed))
-        return PerceptionResult(captured, vehicle, tuple(views), tuple(scans.values()))
+            nowhere = np.full(len(cars), -1, dtype=np.int64)
+            views.append(
+                CameraView(name, camera, mount, image, detections, scan, stereo, cars, nowhere, hiding)
+            )
+        fresh = (scan for name, scan in scans.items() if name not in captured.capture.again)
+        return PerceptionResult(captured, vehicle, tuple(views), tuple(fresh))
+
+    def update_slots(self, slots: SlotFilter, result: PerceptionResult) -> PerceptionResult:
+        """Update the slots from a located capture (T §3.3.2); return it with the slots of its cars."""
+        for scan in result.scans:
+            slots.update_from_scan(scan)
+        views = []
+        for view in result.views:
+            if view.hiding is not None:
+                ground = GroundView(view.camera, view.mount)
+                slots.update_from_picture(ground, result.vehicle, view.hiding, self.errors)
+            views.append(dataclasses.replace(view, slots=slots.update_from_cars(view.cars)))
+        return dataclasses.replace(result, views=tuple(views))
 
     def observe(
         self, captures: Sequence[TimedCapture]
@@ -176,9 +201,14 @@ class PerceptionPipeline:
         Returns:
             The result of each capture, and the observed slots with their states.
         """
+        require(self.lot is not None, "the pipeline has no lot, want one with the slots to observe")
+        assert self.lot is not None
         slots = SlotFilter(self.lot)
         seen = in_threads(self._look, captures) if self._concurrent else map(self._look, captures)
-        results = tuple(self._process(*pair, slots) for pair in zip(captures, seen, strict=True))
+        results = tuple(
+            self.update_slots(slots, self._locate(*pair, None, slots.headings_near))
+            for pair in zip(captures, seen, strict=True)
+        )
         return results, slots.observation()
 
     def _look(self, captured: TimedCapture) -> _Seen:
@@ -215,7 +245,9 @@ class PerceptionPipeline:
         vehicle: FloatArray,
     ) -> dict[str, RangeScan]:
         lasers = {
-            name: scan_from_laser(laser, mount, vehicle, capture.scans[name])
+            name: scan_from_laser(
+                laser, mount, capture.vehicle_at(name, vehicle), capture.scans[name], capture.tops.get(name)
+            )
             for name, laser, mount in self.rig.lasers
         }
         return lasers | {

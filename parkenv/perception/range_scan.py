@@ -23,6 +23,8 @@ _NEAREST = 1.0  # m, the shortest depth that the matcher searches
 _BAND = (0.35, 1.1)  # m above ground: bumpers and doors, below the windows
 _LEAST_PIXELS = 6
 _COLUMNS = 2  # of an image that share a direction
+_SAME_POINT = 1e-6  # m
+_NEIGHBOURS = 40  # beams to either side that may hide one, from a point near by
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,8 @@ class RangeScan:
         angle: (k,) float64, rad, world frame, ascending (counter-clockwise).
         distance: (k,) float64, m; inf if the beam hits nothing within `max_range`, NaN if the range is unknown.
         max_range: m.
+        tops: (k,) float64, m, height above the ground of the highest return of what a beam meets, NaN where it is not
+            known; None: of no beam.
     """
 
     x: float
@@ -41,11 +45,27 @@ class RangeScan:
     angle: FloatArray
     distance: FloatArray
     max_range: float
+    tops: FloatArray | None = None
 
     def points(self, beams: NDArray[np.int64]) -> FloatArray:
         """Return the end points of beams with a finite range, (k, 2) float64, m, world frame."""
         angle, distance = self.angle[beams], self.distance[beams]
         return np.stack([self.x + distance * np.cos(angle), self.y + distance * np.sin(angle)], axis=1)
+
+    def seen_from(self, x: float, y: float) -> RangeScan:
+        """Return the scan as it looks from another point near by, m: what hides there behind something is left out."""
+        if math.hypot(x - self.x, y - self.y) < _SAME_POINT:
+            return self
+        met = np.isfinite(self.distance)
+        away = self.points(np.flatnonzero(met)) - [x, y]
+        angle, distance = self.angle.copy(), self.distance.copy()
+        distance[met] = np.hypot(*away.T)
+        turn = np.arctan2(away[:, 1], away[:, 0]) - angle[met]
+        angle[met] += (turn + math.pi) % (2.0 * math.pi) - math.pi
+        kept = np.flatnonzero(~_hidden_beams(angle, distance))
+        kept = kept[np.argsort(angle[kept], kind="stable")]
+        tops = None if self.tops is None else self.tops[kept]
+        return RangeScan(x, y, angle[kept], distance[kept], self.max_range, tops)
 
     def placed(self, vehicle: FloatArray) -> RangeScan:
         x, y, yaw = Mount(self.x, self.y).in_world(vehicle)
@@ -53,16 +73,23 @@ class RangeScan:
 
 
 def scan_from_laser(
-    laser: LaserScanner, mount: Mount, vehicle: FloatArray, ranges: Float32Array
+    laser: LaserScanner,
+    mount: Mount,
+    vehicle: FloatArray,
+    ranges: Float32Array,
+    tops: Float32Array | None = None,
 ) -> RangeScan:
-    """Convert the ranges of a laser scanner, (n_beams,) m, inf without a return, to the world frame."""
+    """Convert the ranges of a laser scanner, (n_beams,) m, inf without a return, to the world frame; see `Capture`."""
     if ranges.shape != (laser.n_beams,):
         raise InputError(f"scan has shape {ranges.shape}, want ({laser.n_beams},)")
-    if np.isnan(ranges).any() or (ranges < 0.0).any():
-        bad = int(np.flatnonzero(np.isnan(ranges) | (ranges < 0.0))[0])
-        raise InputError(f"scan[{bad}] is {ranges[bad]} m, want at least 0, or inf for no return")
+    if (ranges < 0.0).any():
+        bad = int(np.flatnonzero(ranges < 0.0)[0])
+        raise InputError(f"scan[{bad}] is {ranges[bad]} m, want at least 0, inf for no return, or NaN")
     x, y, yaw = mount.in_world(vehicle)
-    return RangeScan(x, y, yaw + laser.angles.astype(np.float64), ranges.astype(np.float64), laser.max_range)
+    angles, distance = yaw + laser.angles.astype(np.float64), ranges.astype(np.float64)
+    return RangeScan(
+        x, y, angles, distance, laser.max_range, None if tops is None else tops.astype(np.float64)
+    )
 
 
 def scan_from_stereo(
@@ -99,6 +126,17 @@ def disparity(pair: StereoFrame, stereo: StereoCamera) -> Float32Array:
     left, right = (cv2.copyMakeBorder(i, 0, 0, most, 0, cv2.BORDER_REPLICATE) for i in (left, right))
     px = matcher.compute(left, right)[:, most:].astype(np.float32) / 16.0
     return np.where(px > 0.0, px, np.nan).astype(np.float32)
+
+
+@compiled
+def _hidden_beams(angle: FloatArray, distance: FloatArray) -> NDArray[np.bool_]:
+    """Return which beams something nearer hides: those beside which the order of directions has turned round."""
+    hidden = np.zeros(len(angle), dtype=np.bool_)
+    for i in range(len(angle)):
+        for j in range(i + 1, min(i + 1 + _NEIGHBOURS, len(angle))):
+            if angle[j] < angle[i]:
+                hidden[i if distance[i] > distance[j] else j] = True
+    return hidden
 
 
 @compiled

@@ -34,7 +34,6 @@ CAR_HEIGHT = (0.8, 3.2)  # m; range of the height of a box's upper edge
 _LEAST_BEAMS = 3
 MARGIN = 0.02  # of a picture's size; boxes that come this close to its border count as clipped by it
 _EXPLAINED = 0.5  # fraction of a box's beams from which they belong to the nearer car of another box
-_SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +48,9 @@ class LocatedCars:
     # of cars whose place is uncertain, from one picture; None where a sensor has measured the distance
     distance_std: FloatArray | None = None  # (n,) float64, m, standard deviation of the distance
     covariance: FloatArray | None = None  # (n, 2, 2) float64, m², of the centres
+    points: tuple[
+        FloatArray, ...
+    ] = ()  # of cars that a sensor has measured: (k, 2) m, the end points of their beams
 
     def __post_init__(self) -> None:
         n = len(self.yaw)
@@ -159,11 +161,10 @@ def localize_cars(
     The following detections are dropped: those without an obstacle at bumper height; those that, at its distance, would
     not be on the ground or have a car's height; those whose beams end on the nearer car of another box, which hides
     them, or is the same; and cars too hidden to estimate their orientation, with neither a side nor an end visible, or
-    only a part of one at the image border. Later captures show them better. Camera and ranging sensor are on one
-    vertical axis.
+    only a part of one at the image border. Later captures show them better.
     """
-    _require_same_axis(scan, mount, vehicle)
-    rows, cars, distances = [], [], []
+    scan = scan.seen_from(*mount.in_world(vehicle)[:2])
+    rows, cars, distances, points = [], [], [], []
     margins = bearings(camera, mount, vehicle, detections.boxes)
     explained = np.zeros(len(scan.angle), dtype=np.bool_)  # beams that end on the car of another box
     # On the ground, nearer cars reach further down in the image.
@@ -179,14 +180,14 @@ def localize_cars(
             continue
         if not _is_on_ground(detections.boxes[i], float(np.median(scan.distance[beams])), camera, mount):
             continue
-        car = fit_box(
-            scan.points(beams), np.array([scan.x, scan.y]), end_on=bool(detections.end_on[i]), cut=cut
-        )
+        ends = scan.points(beams)
+        car = fit_box(ends, np.array([scan.x, scan.y]), end_on=bool(detections.end_on[i]), cut=cut)
         if car.seen_length < LONG_SIDE and (car.seen_width < WHOLE_END or (any(clipped) and any(cut))):
             continue
         explained[beams] = True
         rows.append(i)
         cars.append(car)
+        points.append(ends)
         distances.append(float(np.median(scan.distance[beams])))
     if not rows:
         return LocatedCars.none()
@@ -197,13 +198,14 @@ def localize_cars(
         np.array(distances),
         detections.probability[rows],
         np.array(rows, dtype=np.int64),
+        points=tuple(points),
     )
 
 
 def localize_median(
     detections: Detections, scan: RangeScan, camera: PinholeCamera, mount: Mount, vehicle: FloatArray
 ) -> LocatedCars:
-    _require_same_axis(scan, mount, vehicle)
+    scan = scan.seen_from(*mount.in_world(vehicle)[:2])
     margins = bearings(camera, mount, vehicle, detections.boxes)
     distance = [median_distance(scan, beams_between(scan, left, right)) for left, right in margins]
     return _cars_behind(detections, np.array(distance), margins, scan.x, scan.y)
@@ -241,15 +243,6 @@ def _cars_behind(
         detections.probability[rows],
         rows.astype(np.int64),
     )
-
-
-def _require_same_axis(scan: RangeScan, mount: Mount, vehicle: FloatArray) -> None:
-    x, y, _ = mount.in_world(vehicle)
-    apart = math.hypot(scan.x - x, scan.y - y)
-    if apart > _SAME_AXIS:
-        raise InputError(
-            f"camera and ranging sensor are {apart:.2f} m apart, want both on one vertical axis (T §4.1)"
-        )
 
 
 def _is_on_ground(box: Float32Array, distance: float, camera: PinholeCamera, mount: Mount) -> bool:
