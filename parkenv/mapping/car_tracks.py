@@ -25,9 +25,8 @@ LEAST_PROBABILITY = 0.5  # of a car that is listed
 _GATE = (2.6, 1.3)  # m along and across a car within which a sighting is of it
 _SPREADS = 3.0  # standard deviations of a sighting from one picture, within which it is of a car
 _OVERLAP = (2.8, 1.3)  # m along and across, between the middles of two cars that cannot both be there
-_SHARE = (
-    0.5  # weight of a further sighting of a car as evidence that there is one: boxes of one thing resemble
-)
+_SHARE = 0.6  # weight of a sighting as evidence that there is a car: boxes of one thing resemble
+_UNPLACED_M = 1.5  # m; sightings from pictures with a larger standard deviation say too little
 _MOVED_M = 1.5  # m between the first and the last third of a car's sightings, beyond which it was on its way
 _WHOLE_LENGTH, _WHOLE_WIDTH = 3.3, 1.5  # m, sides seen so far are seen from end to end
 _AGREED_M = 0.15  # m; end points of sightings this close agree

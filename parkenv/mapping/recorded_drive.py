@@ -74,6 +74,7 @@ class _Taken(NamedTuple):
     stamp: int  # ns, of the picture
     partners: dict[str, int]  # index of the message of each sensor, by key
     pose: FloatArray
+    again: frozenset[str] = frozenset()  # keys of scans that belong to a picture nearer in time
 
 
 @dataclass(eq=False)
@@ -319,7 +320,15 @@ class RecordedDrive:
                 f"{self.path}: no picture of {self._topics[self._first]} has a pose and measurements of all "
                 f"other sensors: cameras within {CAMERAS_S} s, lasers within {LASER_S} s"
             )
-        return plan
+        nearest: dict[tuple[str, int], tuple[int, int]] = {}
+        for k, taken in enumerate(plan):
+            for key, index in taken.partners.items():
+                off = abs(int(self._arrays[key][index]) - taken.stamp)
+                nearest[key, index] = min(nearest.get((key, index), (off, k)), (off, k))
+        return [
+            taken._replace(again=frozenset(key for key, i in taken.partners.items() if nearest[key, i][1] != k))
+            for k, taken in enumerate(plan)
+        ]
 
     def _refuse_pairs(self) -> None:
         for key, stamps in self._arrays.items():
@@ -343,7 +352,7 @@ class RecordedDrive:
         return self._track.at(stamp)
 
     def _capture(self, taken: _Taken, parts: dict[str, Any]) -> tuple[TimedCapture, FloatArray]:
-        stamp, partners, pose = taken
+        stamp, partners, pose, again = taken
         frames = {
             key: Frame(image, _NO_DEPTH, _NO_DEPTH, _NO_IDS)
             for key, image in parts.items()
@@ -371,7 +380,7 @@ class RecordedDrive:
                 name: StereoFrame(frames[f"image:{name}:left"], frames[f"image:{name}:right"])
                 for name, _, _ in self.rig.stereo_cameras
             },
-            scans, moved, tops, tilt,
+            scans, moved, frozenset(key[5:] for key in again if key.startswith("scan:")), tops, tilt,
         )  # fmt: skip
         return TimedCapture(self.start + (stamp - self._stamps["pose"][0]) / 1e9, capture), pose
 
