@@ -15,8 +15,7 @@ BAND_M = 0.3, 0.8  # m above the road, of the returns that make a scan
 BAND_MIDDLE_M = 0.55
 SCANNER = LaserScanner(900, -math.pi, math.radians(0.4), 40.0)
 _MIN_RANGE_M = 0.5
-_LOWEST_LAYER = 1.0  # percentile of the slopes of all returns, that of the lowest layer
-_LAYER_M, _HIGHEST_M = 0.3, 2.0  # m; how far above its lowest layer a near thing is met, and at most above the road
+_OVER_M, _HIGHEST_M = 1.0, 2.0  # m; what is met so much nearer, and up to this high, hides what is in the band
 _TOP_M = 4.0  # what is higher hangs over the road
 _TOP_DEPTH_M = 0.3, 1.2  # before and behind the range of a beam, of what may be the same obstacle
 _ROAD_M = 2.5, 15.0, 3.0  # ahead or behind from, to, and aside: where the road is that the plane is fitted to
@@ -42,7 +41,7 @@ class Road(NamedTuple):
 
 
 class CloudScan(NamedTuple):
-    ranges: Float32Array  # (n_beams,) m, of `SCANNER`; inf without a return
+    ranges: Float32Array  # (n_beams,) m, of `SCANNER`; inf without a return, NaN where it is not known
     tops: Float32Array  # (n_beams,) m above the road; NaN without a return
     tilt: tuple[float, float]  # roll and pitch of the vehicle against the road, rad
 
@@ -126,25 +125,27 @@ def scan_of_cloud(points: FloatArray | Float32Array, road: Road) -> CloudScan:
     to_level = _turn_up(normal).astype(np.float32)
     x, y, up = (points.astype(np.float32) @ to_level.T).T
     height = up - np.float32(road.c * normal[2])
-    distance = level = np.hypot(x, y)
+    distance = np.hypot(x, y)
     kept = (height > BAND_M[0]) & (height < _TOP_M) & (distance >= _MIN_RANGE_M)
     kept &= distance < SCANNER.max_range
     x, y, height, distance = x[kept], y[kept], height[kept], distance[kept]
     n = SCANNER.n_beams
     beam = np.rint((np.arctan2(y, x) - SCANNER.start) / SCANNER.step).astype(np.int64) % n
     ranges = np.full(n, np.inf, np.float32)
-    # Near the sensor its lowest layer is above the band, and meets what stands there higher up.
-    lowest = np.percentile(up / np.maximum(level, 0.1), _LOWEST_LAYER) if len(up) else 0.0
-    band: BoolArray = height <= np.maximum(BAND_M[1], lowest * distance - np.float32(road.c * normal[2]) + _LAYER_M)
-    band &= height <= _HIGHEST_M
+    over = np.full(n, np.inf, np.float32)
+    band: BoolArray = height <= BAND_M[1]
     np.minimum.at(ranges, beam[band], distance[band])
+    np.minimum.at(over, beam[height <= _HIGHEST_M], distance[height <= _HIGHEST_M])
     tops = np.full(n, -np.inf, np.float32)
     for aside in (-1, 0, 1):
         other = (beam + aside) % n
         deeper = distance - ranges[other]
         same = (deeper >= -_TOP_DEPTH_M[0]) & (deeper <= _TOP_DEPTH_M[1])
         np.maximum.at(tops, other[same], height[same])
-    return CloudScan(ranges, np.where(np.isfinite(ranges), tops, np.float32(np.nan)), road.tilt)
+    tops[~np.isfinite(ranges)] = np.nan
+    # Near the sensor its lowest layer is above the band: what stands there may be met only higher up.
+    ranges[over + _OVER_M < ranges] = np.nan
+    return CloudScan(ranges, tops, road.tilt)
 
 
 def _turn_up(normal: FloatArray) -> FloatArray:
