@@ -166,13 +166,6 @@ def test_beams_end_on_the_nearest_car_of_their_boxes():
     np.testing.assert_allclose(alone.xy, [[0.0, -10.0]], atol=0.2)
 
 
-def test_sensors_must_stand_on_one_axis():
-    scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
-    for way in (localize_cars, localize_median):
-        with pytest.raises(InputError, match=r"camera and ranging sensor are 2\.00 m apart"):
-            way(boxes_of([300, 200, 340, 300]), scan, CAMERA, Mount(x=2.0, z=1.3, yaw=EYE.yaw), ORIGIN)
-
-
 @given(
     bearing=st.floats(-1.7, -0.6), away=st.floats(4.0, 9.0), yaw=st.floats(0.0, math.pi - 0.01),
     length=st.floats(3.8, 5.0), width=st.floats(1.6, 2.0), seed=st.integers(0, 9),

@@ -330,7 +330,10 @@ def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_pa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"poses": 0}, r"has no poses in /odom, want .*Odometry .*; it has /camera \(sensor_msgs/msg/Image\)"),
+        (
+            {"poses": 0},
+            r"has no poses in /odom, want .*Odometry .*; it has /camera \(sensor_msgs/msg/Image\)",
+        ),
         ({"shift": {"/odom": 100.0}}, r"/camera ends at .* before /odom begins at .*: do their clocks"),
         ({"shift": {"/scan": -3.0}}, r"/scan ends at .* before /.* begins at .*; want streams that overlap"),
         ({"order": {"/odom": [0, 1, 3, 2, 4]}}, r"/odom: time goes from .* to .* s at message 4, want it"),

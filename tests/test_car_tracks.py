@@ -1,0 +1,129 @@
+"""Cars of a drive are joined over captures: one car, one place, with its error."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from parkenv.mapping.car_tracks import CAR_LENGTH, CarTracks
+from parkenv.perception.detector import Detections
+from parkenv.perception.pipeline import CameraView
+from parkenv.perception.range_scan import RangeScan
+from parkenv.perception.ranging import LocatedCars, localize_cars
+from sim_sensors.camera.models import PinholeCamera
+from sim_sensors.laser.footprints import ScanPlane
+from sim_sensors.rig import Mount, SensorRig
+
+CAMERA = PinholeCamera.from_field_of_view(horizontal=math.pi / 2)
+
+
+def outline(x, y, yaw, length, width, sides):
+    """Return points every 5 cm on sides of a rectangle: l, r (flanks), f, b (ends), (k, 2) m."""
+    u, v = np.arange(-length / 2, length / 2, 0.05), np.arange(-width / 2, width / 2, 0.05)
+    parts = {
+        "l": np.column_stack([u, np.full_like(u, width / 2)]),
+        "r": np.column_stack([u, np.full_like(u, -width / 2)]),
+        "f": np.column_stack([np.full_like(v, length / 2), v]),
+        "b": np.column_stack([np.full_like(v, -length / 2), v]),
+    }
+    local = np.concatenate([parts[side] for side in sides])
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([x, y]) + local @ np.array([[c, s], [-s, c]])
+
+
+def sighting(points, xy, yaw, p, eye):
+    """Return a view of one car."""
+    cars = LocatedCars(
+        np.array([xy]), np.array([yaw % math.pi]), np.array([[4.4, 1.8]]), np.array([5.0]), np.float32([p]),
+        np.array([0]), points=(points,),
+    )  # fmt: skip
+    scan = RangeScan(*eye, np.empty(0), np.empty(0), 40.0)
+    boxes = Detections(np.array([[0.0, 0.0, 9.0, 9.0]]), np.float32([p]))
+    picture = np.zeros((1, 1, 3), np.uint8)
+    return CameraView("c", CAMERA, Mount(), picture, boxes, scan, None, cars, np.array([-1]))
+
+
+@settings(max_examples=25, deadline=None)
+@given(yaw=st.floats(0.0, 3.1), length=st.floats(4.2, 5.2), width=st.floats(1.6, 2.0))
+def test_a_car_seen_from_both_its_ends_has_its_size_and_place(yaw, length, width):
+    tracks, ahead = CarTracks(), np.array([math.cos(yaw), math.sin(yaw)])
+    aside = np.array([ahead[1], -ahead[0]])
+    for k, (along, sides) in enumerate([(-6.0, "br"), (0.0, "r"), (6.0, "fr")]):
+        eye = np.array([20.0, 10.0]) + along * ahead + 4.0 * aside
+        points = outline(20.0, 10.0, yaw, length, width, sides)
+        tracks.add(float(k), sighting(points, (20.0, 10.0) + 0.3 * (k - 1) * ahead, yaw, 0.8, eye))
+    cars = tracks.cars()
+    assert len(cars.xy) == 1 and cars.sightings.tolist() == [3]
+    assert np.hypot(*(cars.xy[0] - [20.0, 10.0])) < 0.15 + abs(length - CAR_LENGTH) / 2 * 0.2
+    assert abs((cars.yaw[0] - yaw + math.pi / 2) % math.pi - math.pi / 2) < math.radians(3.0)
+    assert cars.size[0, 0] == pytest.approx(length, abs=0.4)
+
+
+def test_a_rear_alone_is_half_a_usual_car_before_its_middle():
+    tracks = CarTracks()
+    for k in range(3):
+        points = outline(10.0, 3.0, 0.0, CAR_LENGTH, 1.8, "b")
+        tracks.add(float(k), sighting(points, (10.0, 3.0), 0.0, 0.9, (0.5 * k, 3.2)))
+    cars = tracks.cars()
+    assert np.allclose(cars.xy, [[10.0, 3.0]], atol=0.1)
+    assert cars.std[0] > 0.25  # nobody has seen its front
+    assert cars.distance[0] == pytest.approx(10.0 - CAR_LENGTH / 2 - 1.0, abs=0.1)
+
+
+def test_walls_cars_on_their_way_and_unlikely_boxes_are_no_parked_cars():
+    tracks = CarTracks()
+    for k in range(4):
+        wall = outline(30.0, 5.0, 0.0, 9.0, 0.2, "r")
+        tracks.add(float(k), sighting(wall, (30.0, 5.0), 0.0, 0.9, (20.0 + k, 0.0)))
+        moving = outline(60.0 + k, -5.0, 0.0, 4.4, 1.8, "bl")
+        tracks.add(float(k), sighting(moving, (60.0 + k, -5.0), 0.0, 0.9, (20.0 + k, 0.0)))
+        parked = outline(80.0, 5.0, 0.0, 4.4, 1.8, "br")
+        tracks.add(float(k), sighting(parked, (80.0, 5.0), 0.0, 0.9, (20.0 + k, 0.0)))
+    hedge = outline(100.0, 5.0, 0.0, 4.4, 1.8, "r")
+    tracks.add(9.0, sighting(hedge, (100.0, 5.0), 0.0, 0.3, (95.0, 0.0)))
+    assert np.allclose(tracks.cars().xy, [[80.0, 5.0]], atol=0.2)
+
+
+def test_a_car_askew_in_a_row_takes_the_heading_of_the_row():
+    tracks = CarTracks()
+    for k in range(5):
+        points = outline(6.0 * k, 3.0, 0.0, 4.4, 1.8, "r")
+        if k == 2:
+            points = outline(6.0 * k, 3.0, 0.5, 1.5, 1.5, "r")
+        for time in range(2):
+            tracks.add(
+                float(time), sighting(points, (6.0 * k, 3.0), 0.5 * (k == 2), 0.9, (6.0 * k - 5.0, -2.0))
+            )
+    turned = np.abs((tracks.cars().yaw + math.pi / 2) % math.pi - math.pi / 2)
+    assert len(turned) == 5 and turned.max() < math.radians(3.0)
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0), (0.8, -0.3), (-1.5, 0.5)])
+def test_a_laser_beside_the_camera_locates_the_same_cars(at):
+    """The camera is at the vehicle's middle and looks to the right at a car 5 m away."""
+    car = np.array([[-2.2, -5.9], [2.2, -5.9], [2.2, -4.1], [-2.2, -4.1]])
+    plane = ScanPlane(car[None])
+    rig, mount = SensorRig.thesis(), Mount(z=1.3, yaw=-math.pi / 2)
+    scanner = rig.lasers[0][1]
+    vehicle = np.array([0.0, 0.0, 0.0])
+    ranges = scanner.scan(plane, (*at, 0.0), None)
+    scan = RangeScan(*at, scanner.angles.astype(float), ranges.astype(float), scanner.max_range)
+    half = CAMERA.fx * 2.2 / 4.1
+    top, bottom = (CAMERA.cy + CAMERA.fy * (1.3 - z) / 4.1 for z in (1.5, 0.0))
+    box = np.array([[CAMERA.cx - half, top, CAMERA.cx + half, bottom]])
+    cars = localize_cars(Detections(box, np.float32([0.9])), scan, CAMERA, mount, vehicle)
+    assert np.allclose(cars.xy, [[0.0, -5.0]], atol=0.1)
+
+
+def test_what_hides_from_the_other_point_is_left_out_of_a_scan():
+    angle = np.radians(np.arange(-60.0, 60.5, 0.5))
+    distance = np.where(np.abs(angle) < math.radians(10.0), 3.0, 10.0)
+    scan = RangeScan(0.0, 0.0, angle, distance, 40.0)
+    assert scan.seen_from(0.0, 0.0) is scan
+    moved = scan.seen_from(0.0, 1.0)  # from the left, the post hides more on its right
+    assert (np.diff(moved.angle) >= 0.0).all()
+    assert len(moved.angle) < len(angle)
+    near = moved.points(np.flatnonzero(moved.distance < 5.0))
+    assert np.allclose(np.hypot(*near.T), 3.0)
