@@ -60,8 +60,8 @@ class ParkedCars:
     std: FloatArray  # (n,) m, standard deviation of the centre in each direction
     probability: FloatArray  # (n,) P(there is a car)
     sightings: IntArray  # (n,) captures in which it was located
-    distance: FloatArray  # (n,) m, least distance from the sensor to its nearest side
-    time: FloatArray  # (n,) s, when it was nearest
+    distance: FloatArray  # (n,) m, how near the vehicle came to its nearest side
+    time: FloatArray  # (n,) s, when it was located from nearest
 
 
 class _Place(NamedTuple):
@@ -166,8 +166,11 @@ class CarTracks:
             track.points.append(points)
             track.eyes.append(np.array([view.scan.x, view.scan.y]))
 
-    def cars(self, least: float = LEAST_PROBABILITY) -> ParkedCars:
-        """Return the cars that are there with a probability of at least `least`, and that stood still."""
+    def cars(self, track: FloatArray, least: float = LEAST_PROBABILITY) -> ParkedCars:
+        """Return the cars that are there with a probability of at least `least`, and that stood still.
+
+        `track`, (k, 2) m, is where the vehicle has been.
+        """
         tracks = [t for t in _joined(self._tracks) if t.chance >= least and not t.has_moved]
         places = [_placed(track) for track in tracks]
         places = [
@@ -184,7 +187,7 @@ class CarTracks:
             table[:, 5],
             np.array([track.chance for track in tracks]),
             np.array([len(track.times) for track in tracks], dtype=np.int64),
-            np.array([distances.min() for distances in away]),
+            np.array([_Place(*row).distances(track).min() for row in table]),
             np.array([track.times[d.argmin()] for track, d in zip(tracks, away, strict=True)]),
         )
 

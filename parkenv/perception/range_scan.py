@@ -17,8 +17,8 @@ from sim_sensors.camera.models import StereoCamera, StereoFrame
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount
 
-STEREO_RANGE = 12.0
-"""Range of stereo measurements, m; beyond it, half a pixel of disparity corresponds to more than a metre."""
+STEREO_RANGE = 12.0, 25.0
+"""Least and largest range of stereo measurements, m: between them, half a pixel of disparity corresponds to 1 m."""
 _NEAREST = 1.0  # m, the shortest depth that the matcher searches
 _BAND = (0.35, 1.1)  # m above ground: bumpers and doors, below the windows
 _LEAST_PIXELS = 6
@@ -102,9 +102,10 @@ def scan_from_stereo(
     camera = stereo.camera
     x, y, yaw = mount.in_world(vehicle)
     focal_baseline = camera.fx * stereo.baseline
-    depth = _column_depths(disparity_px, focal_baseline, camera.fy, camera.cy, mount.z, *_BAND, STEREO_RANGE)
+    reach = min(max(STEREO_RANGE[0], math.sqrt(2.0 * focal_baseline)), STEREO_RANGE[1])
+    depth = _column_depths(disparity_px, focal_baseline, camera.fy, camera.cy, mount.z, *_BAND, reach)
     aside = np.arctan2(_COLUMNS * (np.arange(len(depth)) + 0.5) - camera.cx, camera.fx)
-    return RangeScan(x, y, (yaw - aside)[::-1], (depth / np.cos(aside))[::-1], STEREO_RANGE)
+    return RangeScan(x, y, (yaw - aside)[::-1], (depth / np.cos(aside))[::-1], reach)
 
 
 def disparity(pair: StereoFrame, stereo: StereoCamera) -> Float32Array:
