@@ -166,10 +166,10 @@ class CarTracks:
             track.points.append(points)
             track.eyes.append(np.array([view.scan.x, view.scan.y]))
 
-    def cars(self, track: FloatArray, least: float = LEAST_PROBABILITY) -> ParkedCars:
+    def cars(self, way: FloatArray, least: float = LEAST_PROBABILITY) -> ParkedCars:
         """Return the cars that are there with a probability of at least `least`, and that stood still.
 
-        `track`, (k, 2) m, is where the vehicle has been.
+        `way`, (k, 2) m, is where the vehicle has been.
         """
         tracks = [t for t in _joined(self._tracks) if t.chance >= least and not t.has_moved]
         places = [_placed(track) for track in tracks]
@@ -187,7 +187,7 @@ class CarTracks:
             table[:, 5],
             np.array([track.chance for track in tracks]),
             np.array([len(track.times) for track in tracks], dtype=np.int64),
-            np.array([_Place(*row).distances(track).min() for row in table]),
+            np.array([_Place(*row).distances(way).min() for row in table]),
             np.array([track.times[d.argmin()] for track, d in zip(tracks, away, strict=True)]),
         )
 
