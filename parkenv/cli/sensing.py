@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, Field, PrivateAttr
+from pydantic import AfterValidator, Field
+from pydantic.fields import FieldInfo
 
-from parkenv.cli.options import Command, Given
+from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, print_rows, print_table, save_summary, stages
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError, nearest, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, LocaliserName, RigName, WeatherName
-from parkenv.files.option import Inside, option, words_in
-from parkenv.files.spec_file import Axis
+from parkenv.files.option import Inside, Option, option, words_in
+from parkenv.files.spec_file import Axis, Several
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.columns import Column
@@ -27,6 +28,13 @@ from parkenv.studies.study import ExecutionSpec, counted
 from parkenv.world.occupancy.arrival_window import DAY_NAMES
 from parkenv.world.week import DAY_S, HOUR_S
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from parkenv.studies.results import Row
+    from parkenv.world.scenario import Scenario
+
+_OPTIONS_OF_SCENARIO = [mark for mark in get_args(OneScenario) if isinstance(mark, Option | FieldInfo)]
 MOST_ROWS = 12  # slots in the table of a map; files have all
 
 
@@ -34,6 +42,9 @@ class MapDrive(Command):
     """A recording names its sensors (`CameraInfo`, TF, KITTI's calibration), or a calibration file does.
 
     For photographs or a film with poses, distances follow from the boxes: from the ground and a car's size.
+
+    With --discover, no lot is needed: rows of parked cars become the slots of a new one, lot.geojson in the folder.
+    Later drives into the same folder refine it.
     """
 
     examples = """
@@ -42,16 +53,26 @@ class MapDrive(Command):
         parkenv map-drive bag.mcap --lot lot.geojson --calibration car.toml
         parkenv map-drive photos/ --lot lot.geojson --fov 68 --detector net
         parkenv map-drive drive.mp4 --poses track.gpx --lot lot.geojson --fov 90
+        parkenv map-drive mon.mcap tue.mcap --discover --calibration car.toml
         """
 
-    recording: Path = option(
+    recordings: Several[Path] = option(
         ...,
         "A folder of photographs, of a drive or of KITTI, or a film; or (extra bags) an MCAP file, or a rosbag of "
-        "ROS 2 (folder, .db3) or ROS 1 (.bag).",
+        "ROS 2 (folder, .db3) or ROS 1 (.bag). Several with --discover.",
+        name="RECORDING",
         takes="FILE|DIR",
         argument=True,
+        min_length=1,
     )
-    scenario: Annotated[OneScenario, Inside(only=())] = scenario_spec("campus")
+    scenario: Annotated[OneScenario | None, *_OPTIONS_OF_SCENARIO, Inside(only=())] = None
+    discover: bool = option(False, "Make a lot from the parked cars that the drives have passed.")
+    streets: Path | None = option(
+        None,
+        "With --discover: a map whose streets are the lanes (OpenStreetMap; extra osm).",
+        takes="FILE",
+        default="where the drives went",
+    )
     calibration: Path | None = option(
         None, "Sensors, mounts and topics (.toml).", default="those of the recording"
     )
@@ -61,50 +82,55 @@ class MapDrive(Command):
     photos: PhotoOptions = PhotoOptions()
     out: Path = option(
         Path("results/drive"),
-        "Folder for map.sqlite, to which the session is added, map.png, cars.csv and summary.json.",
+        "Folder for map.sqlite, to which the session is added, map.png and map.yaml (the occupancy grid, for Nav2), "
+        "slots.geojson, slots.png, cars.csv, sightings.csv and summary.json.",
         short="-o",
     )
-
-    _names_lot: bool = PrivateAttr(True)
-
-    @classmethod
-    def of(cls, given: Given) -> Self:
-        command = super().of(given)
-        command._names_lot = not given.keys().isdisjoint(("--lot", "--scenario"))
-        return command
 
     def run(self) -> None:
         from parkenv.mapping.drive_calibration import DriveCalibration
         from parkenv.scenarios.build import build
         from parkenv.studies.sensing.recorded_session import add_recording
+        from parkenv.studies.sensing.street_discovery import discover_recordings
 
-        scenario = build(self.scenario)
+        require(
+            not (self.discover and self.scenario), "--discover makes a lot; want no --lot and no --scenario"
+        )
+        require(self.discover or self.streets is None, "--streets is of --discover")
+        require(self.discover or len(self.recordings) == 1, "several recordings are of --discover, want one")
+        scenario = None if self.scenario is None else build(self.scenario)
         calibration = None if self.calibration is None else DriveCalibration.read(self.calibration)
         console = make_console()
         with stages(console, "captures") as progress:
-            row = add_recording(
-                self.recording,
-                scenario,
-                self.out,
-                calibration=calibration,
-                detector=self.detector or scenario.detector,
-                every=self.every,
-                localise=self.localise,
-                photos=self.photos,
-                lot_file=self.scenario.lot.file,
-                names_lot=self._names_lot,
-                progress=progress,
-            )
-        save_summary(self.out, None, [row])
-        print_table(console, table_of("", "The drive", [row], COLUMNS, facts=True))
+            given: dict[str, Any] = {
+                "calibration": calibration,
+                "detector": self.detector or (scenario.detector if scenario else "hog"),
+                "every": self.every,
+                "localise": self.localise,
+                "photos": self.photos,
+                "progress": progress,
+            }
+            if self.discover:
+                rows = discover_recordings(self.recordings, self.out, streets=self.streets, **given)
+            else:
+                lot_file = self.scenario.lot.file if self.scenario else None
+                rows = [add_recording(self.recordings[0], scenario, self.out, lot_file=lot_file, **given)]
+        save_summary(self.out, None, rows)
+        for row in rows:
+            print_table(console, table_of("", "The drive", [row], COLUMNS, facts=True))
+            self._warn(console, row, scenario)
+        lot = "lot.geojson, " if self.discover else ""
+        written = "map.png, map.yaml, slots.geojson, slots.png, cars.csv, sightings.csv, summary.json"
+        console.print(f"Written: {self.out / 'map.sqlite'}, {lot}{written}")
+
+    def _warn(self, console: Console, row: Row, scenario: Scenario | None) -> None:
         driven_in = row["key"].partition("/")[0]
-        if driven_in in SCENARIO_NAMES and driven_in != scenario.name:
+        if scenario and driven_in in SCENARIO_NAMES and driven_in != scenario.name:
             text = f"The drive was recorded in {driven_in}, and is mapped in {scenario.name}: see --scenario"
             console.print(text, style="yellow")
         if not row["seen"]:
             why = f": poses ± {row['pose_error_m']:.2g} m; see --pose-error" if "pose_error_m" in row else ""
             console.print(f"No slot could be identified{why}", style="yellow")
-        console.print(f"Written: {self.out / 'map.sqlite'}, map.png, cars.csv, summary.json")
 
 
 class Map(Command):

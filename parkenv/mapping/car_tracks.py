@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.perception.box_fit import CAR_WIDTH, LONG_SIDE, direction_of
 from parkenv.perception.pipeline import CameraView
+from parkenv.perception.ranging import LocatedCars
 
 CAR_LENGTH = 4.1  # m, of cars whose ends have not both been seen: between KITTI's mean of 3.9 and today's 4.3
 LONGEST, WIDEST = 6.0, 2.4  # m; what is longer is a wall or a hedge
@@ -62,6 +63,11 @@ class ParkedCars:
     sightings: IntArray  # (n,) captures in which it was located
     distance: FloatArray  # (n,) m, how near the vehicle came to its nearest side
     time: FloatArray  # (n,) s, when it was located from nearest
+
+    @property
+    def located(self) -> LocatedCars:
+        probability, cars = self.probability.astype(np.float32), np.arange(len(self.yaw), dtype=np.int64)
+        return LocatedCars(self.xy, self.yaw, self.size, self.distance, probability, cars)
 
 
 class _Place(NamedTuple):

@@ -24,7 +24,7 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.drive_sources import CLOUD_SUFFIXES, CloudFile, PictureFile, Stream, header, opened
 from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.photographs import POSES, errors_of_poses, in_metres, pose_stream
+from parkenv.mapping.photographs import POSES, errors_of_poses, frame_of, pose_stream
 from parkenv.perception.monocular import RangingErrors
 
 _TIMES = "times.csv"
@@ -56,7 +56,7 @@ def _there(path: Path, topic: str) -> Path | None:
 
 
 class DriveFolder:
-    """A folder of a drive; see the module. `frame` is that of a lot whose file has degrees."""
+    """A folder of a drive; see the module. `frame` and `own_frame` are as in `Photographs`."""
 
     def __init__(
         self,
@@ -64,6 +64,8 @@ class DriveFolder:
         calibration: DriveCalibration,
         options: PhotoOptions,
         frame: LocalFrame | None = None,
+        *,
+        own_frame: bool = False,
     ) -> None:
         self.path, self.without_pose = path, 0
         self.calibration: DriveCalibration | None = calibration
@@ -74,7 +76,8 @@ class DriveFolder:
             raise InputError(f"{path}: has no poses, want {POSES} in it, or --poses FILE (.csv, .gpx)")
         self._track = read_track(poses, self._zone_s)
         with naming(poses):
-            self._poses = pose_stream(self._track, in_metres(self._track, options, frame))
+            self.frame = frame_of(self._track, options, frame, own_frame)
+            self._poses = pose_stream(self._track, self.frame)
         self.errors: RangingErrors | None = errors_of_poses(self._track, options)
         self._streams = {topic: self._stream(topic) for topic in self._topics}
 

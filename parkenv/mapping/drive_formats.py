@@ -15,14 +15,18 @@ from parkenv.mapping.photographs import Photographs, is_photographs
 
 
 def source_of(
-    path: Path, calibration: DriveCalibration | None, options: PhotoOptions, frame: LocalFrame | None
+    path: Path,
+    calibration: DriveCalibration | None,
+    options: PhotoOptions,
+    frame: LocalFrame | None,
+    own_frame: bool = False,
 ) -> Source:
     """Return what reads a drive: of KITTI, of a folder that the calibration describes, of photographs, or a bag."""
     kitti = kitti_folder(path)
     if kitti is None and is_drive_folder(path, calibration) and calibration is not None:
-        return DriveFolder(path, calibration, options, frame)
+        return DriveFolder(path, calibration, options, frame, own_frame=own_frame)
     if kitti is None and is_photographs(path):
-        return Photographs(path, options, calibration, frame)
+        return Photographs(path, options, calibration, frame, own_frame=own_frame)
     if options.changed(origin=None) != PhotoOptions():
         raise InputError(f"{path}: has poses of its own, want no options of photographs but --origin")
     return kitti or Bag(path)

@@ -135,7 +135,7 @@ class PoseReader:
     """Collects the messages that poses are made of; `frame` is the lot's, None for one around the first position."""
 
     def __init__(self, kind: str, tree: FrameTree, base: str | None, frame: LocalFrame | None) -> None:
-        self.kind, self._tree, self._base, self._frame = kind, tree, base, frame
+        self.kind, self._tree, self._base, self.frame = kind, tree, base, frame
         self.std: float = 0.0  # m, that a receiver states of its positions
         self._poses: list[Pose] = []
         self._turns: list[tuple[int, float, float, float]] = []
@@ -172,8 +172,8 @@ class PoseReader:
         if self.kind != NAV_FIX or not len(found):
             return stamps, found
         self.std = math.sqrt(float(np.median(self._variances))) if self._variances else 0.0
-        frame = self._frame or LocalFrame(float(found[0, 0]), float(found[0, 1]))
-        found[:, :2] = frame.to_xy(found[:, :2])
+        self.frame = self.frame or LocalFrame(float(found[0, 0]), float(found[0, 1]))
+        found[:, :2] = self.frame.to_xy(found[:, :2])
         times = np.array(stamps, np.int64)
         turns = np.array(sorted(self._turns), dtype=object)
         if len(turns):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_arrays, read_bytes, read_text
 from parkenv.files.recordings import Messages, open_recording
+from parkenv.lots.local_frame import LocalFrame
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.perception.monocular import RangingErrors
 
@@ -31,6 +32,10 @@ class Source(Protocol):
         """Errors of its poses; None for the usual ones."""
 
     @property
+    def frame(self) -> LocalFrame | None:
+        """Where x = y = 0 of its poses is, if they were made of degrees."""
+
+    @property
     def without_pose(self) -> int:
         """Number of pictures that it leaves out, as no pose is of their time."""
 
@@ -45,6 +50,7 @@ class Bag:
     path: Path
     calibration: DriveCalibration | None = None
     errors: RangingErrors | None = None
+    frame: LocalFrame | None = None
     without_pose: int = 0
 
     def open(self) -> AbstractContextManager[tuple[dict[str, str], Messages]]:

@@ -106,6 +106,11 @@ class OccupancyGrid:
             )
         )  # fmt: skip
 
+    def merge(self, other: OccupancyGrid) -> None:
+        """Add the evidence of another grid of the same cells."""
+        self.log_odds = np.clip(self.log_odds + other.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS)
+        self.seen |= other.seen
+
     def _cells(self, x: float, y: float) -> tuple[float, float]:
         return (x - self.low[0]) / self.cell, (y - self.low[1]) / self.cell
 

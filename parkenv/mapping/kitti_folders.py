@@ -18,6 +18,7 @@ from parkenv.errors import InputError
 from parkenv.files.images import SUFFIXES, files_in, read_image
 from parkenv.files.limited_reading import read_text
 from parkenv.files.recordings import CAMERA_INFO, CLOUD, COMPRESSED_IMAGE, IMU, NAV_FIX, TRANSFORMS, Messages
+from parkenv.lots.local_frame import LocalFrame
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.drive_sources import (
     CLOUD_SUFFIXES,
@@ -45,6 +46,7 @@ class KittiFolder:
 
     calibration: DriveCalibration | None = None
     errors: RangingErrors | None = None
+    frame: LocalFrame | None = None
     without_pose = 0
 
     def __init__(self, path: Path, read: Callable[[Path], dict[str, Stream]]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import IntArray
 from parkenv.errors import InputError, naming
 from parkenv.files.images import image_time, images_in, read_image
 from parkenv.files.recordings import IMAGE, POSE_2D, Messages
@@ -38,7 +38,8 @@ class Photographs:
     """A folder of photographs or a film, with poses.
 
     `calibration` is of one camera, None for `options.fov`, `frame` that of a lot whose file has degrees, `errors` those
-    of the poses. The table of poses does not name `without_pose` of the photographs.
+    of the poses. The table of poses does not name `without_pose` of the photographs. Of poses in degrees, `frame` is
+    where the origin is; with `own_frame`, their middle if nothing else says where.
     """
 
     def __init__(
@@ -47,6 +48,8 @@ class Photographs:
         options: PhotoOptions,
         calibration: DriveCalibration | None = None,
         frame: LocalFrame | None = None,
+        *,
+        own_frame: bool = False,
     ) -> None:
         self.path, self._options = path, options
         self._film = None if path.is_dir() else Video.of(path)
@@ -65,7 +68,8 @@ class Photographs:
             )
         self.track = read_track(poses, self._zone_s)
         with naming(poses):
-            self._poses = pose_stream(self.track, in_metres(self.track, options, frame))
+            self.frame = frame_of(self.track, options, frame, own_frame)
+            self._poses = pose_stream(self.track, self.frame)
         self.errors: RangingErrors | None = errors_of_poses(self.track, options)
         pictures = len(self._files)
         self._stamps = self._times() if self._film is None else None
@@ -137,20 +141,23 @@ class Photographs:
         return CameraSpec(name="camera", mount=parsed, **numbers)
 
 
-def in_metres(track: Track, options: PhotoOptions, frame: LocalFrame | None) -> FloatArray:
-    """Return the positions of a track in the lot, (n, 2) m; `frame` is that of a lot whose file has degrees."""
+def frame_of(
+    track: Track, options: PhotoOptions, frame: LocalFrame | None, own_frame: bool
+) -> LocalFrame | None:
+    """Return the frame of a track in degrees: `--origin`, that of the lot, or its own around its middle."""
     if not track.in_degrees:
-        return track.positions
+        return None
     if options.origin is not None:
         lat, lon = options.origin
-        frame = LocalFrame(lon, lat)
-    if frame is None:
+        return LocalFrame(lon, lat)
+    if frame is None and not own_frame:
         raise InputError("is in degrees, and the lot in metres; want --origin LAT,LON of its x = y = 0")
-    return frame.to_xy(track.positions)
+    return frame or LocalFrame.around(track.positions)
 
 
-def pose_stream(track: Track, xy: FloatArray) -> Stream:
+def pose_stream(track: Track, frame: LocalFrame | None) -> Stream:
     """Return the poses of a track as messages; pictures at one without a heading are left out."""
+    xy = track.positions if frame is None else frame.to_xy(track.positions)
     poses = np.column_stack([xy, track.headings(xy)]).tolist()
     return POSE_2D, [
         (stamp, partial(SimpleNamespace, x=x, y=y, theta=yaw))

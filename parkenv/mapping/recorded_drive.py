@@ -10,7 +10,7 @@ left out. Times are those of the messages' headers, of messages without header t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +32,7 @@ from parkenv.files.recordings import (
     stamp_of,
 )
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.mapping.car_tracks import CarTracks, ParkedCars
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.drive_poses import PoseReader, PoseTrack, within
 from parkenv.mapping.drive_setup import DriveSetup, set_up
@@ -45,8 +46,8 @@ from parkenv.mapping.store import Session
 from parkenv.mapping.survey import SessionMap
 from parkenv.perception.detector import Detector
 from parkenv.perception.monocular import RangingErrors
-from parkenv.perception.pipeline import CameraView, PerceptionPipeline
-from parkenv.perception.slot_filter import SlotStates
+from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult
+from parkenv.perception.slot_filter import SlotFilter, SlotStates
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import DAY_S
 from sim_sensors.camera.models import Frame, StereoFrame
@@ -67,7 +68,9 @@ class MappedDrive:
     grid: OccupancyGrid  # the occupancy grid
     frames: int  # captures that were used
     corrected_m: float  # m, greatest distance between a recorded pose and what it was corrected to
-    cars: list[dict[str, Any]]  # each located car: time, place, distance and slot, with standard deviations
+    parked: ParkedCars  # the cars it has passed
+    cars: list[dict[str, Any]]  # of each: place, size, errors and slot
+    sightings: list[dict[str, Any]]  # of each car located in a picture: the same, and the time
 
 
 class _Taken(NamedTuple):
@@ -118,6 +121,7 @@ class RecordedDrive:
                 raise InputError(f"{self.path}: {HEAD} names no rig of {', '.join(RIG_NAMES)}")
             self._finish(reader)
         self.errors = source.errors
+        self.frame = source.frame or (reader.frame if kind == NAV_FIX else self.frame)
         if kind == NAV_FIX and reader.std:
             self.errors = RangingErrors.of_poses(reader.std, 0.0)
 
@@ -326,7 +330,9 @@ class RecordedDrive:
                 off = abs(int(self._arrays[key][index]) - taken.stamp)
                 nearest[key, index] = min(nearest.get((key, index), (off, k)), (off, k))
         return [
-            taken._replace(again=frozenset(key for key, i in taken.partners.items() if nearest[key, i][1] != k))
+            taken._replace(
+                again=frozenset(key for key, i in taken.partners.items() if nearest[key, i][1] != k)
+            )
             for k, taken in enumerate(plan)
         ]
 
@@ -443,28 +449,78 @@ def map_drive(
     What corrects the recorded poses is `none`, or `scan-matching`, for which they are drifting odometry. `on_frame` is
     called after every capture.
     """
+    require_ranges(drive, localise)
+    mapped = SessionMap(PerceptionPipeline(drive.rig, lot, detector, drive.errors), lot, localise)
+    captures = drive.captures(every)
+    return mapped_drive(drive, lot, mapped, ((mapped.add(*one), one[1]) for one in captures), on_frame)
+
+
+def require_ranges(drive: RecordedDrive, localise: str) -> None:
     if localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
         raise InputError(f"localise is {localise!r}, want none: {drive.path} has no laser nor stereo camera")
-    mapped = SessionMap(PerceptionPipeline(drive.rig, lot, detector, drive.errors), lot, localise)
-    shifts, cars = [], []
-    for captured, recorded in drive.captures(every):
-        result = mapped.add(captured, recorded)
+
+
+def mapped_drive(
+    drive: RecordedDrive,
+    lot: ParkingLot,
+    mapped: SessionMap,
+    results: Iterable[tuple[PerceptionResult, FloatArray]],
+    on_frame: Callable[[], None] = lambda: None,
+) -> MappedDrive:
+    """Return what a session mapped, from the result of each capture and its recorded pose."""
+    shifts, tracks = [], CarTracks()
+    sightings: list[dict[str, Any]] = []
+    for result, recorded in results:
         shifts.append(np.hypot(*(result.vehicle - recorded)[:2]))
-        cars += [row for view in result.views for row in _car_rows(captured.time, view, lot)]
+        for view in result.views:
+            tracks.add(result.captured.time, view)
+            sightings += _sightings(result.captured.time, view, lot)
         on_frame()
     rig, weather = (drive.head.rig, drive.head.weather) if drive.head else ("recorded", "unknown")
     session = mapped.session(drive.key, drive.start, rig, weather)
+    parked = tracks.cars(drive.poses[:, :2])
     return MappedDrive(
-        session, mapped.slots.states(), mapped.grid, len(shifts), float(max(shifts, default=0.0)), cars
+        session, mapped.slots.states(), mapped.grid, len(shifts), float(max(shifts, default=0.0)), parked,
+        list(_rows_of(parked, lot, mapped.slots)), sightings,
+    )  # fmt: skip
+
+
+def _rows_of(parked: ParkedCars, lot: ParkingLot, slots: SlotFilter) -> Iterator[dict[str, Any]]:
+    of_slots = slots.slots_of(parked.located).tolist()
+    columns = (
+        parked.time,
+        parked.xy,
+        parked.yaw,
+        parked.size,
+        parked.std,
+        parked.probability,
+        parked.distance,
     )
+    names = (
+        "time_s",
+        "x_m",
+        "y_m",
+        "yaw_rad",
+        "length_m",
+        "width_m",
+        "position_std_m",
+        "probability",
+        "distance_m",
+    )
+    for row, n, slot in zip(
+        np.column_stack(columns).tolist(), parked.sightings.tolist(), of_slots, strict=True
+    ):
+        place: dict[str, Any] = {name: round(value, 3) for name, value in zip(names, row, strict=True)}
+        yield place | {"sightings": n, "slot": lot.slot_ids[slot] if slot >= 0 else ""}
 
 
-def _car_rows(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[str, Any]]:
+def _sightings(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[str, Any]]:
     cars = view.cars
     for k, (x, y, yaw) in enumerate(cars.poses.tolist()):
         place = {"time_s": time, "camera": view.name, "x_m": x, "y_m": y, "yaw_rad": yaw}
         slot = int(view.slots[k])
-        place |= {"distance_m": float(cars.distance[k]), "slot": lot.slot_ids[slot] if slot >= 0 else ""}
+        place |= {"probability": float(cars.probability[k]), "distance_m": float(cars.distance[k])}
+        place |= {"slot": lot.slot_ids[slot] if slot >= 0 else ""}
         if cars.distance_std is not None and cars.covariance is not None:
             spread = math.sqrt(np.trace(cars.covariance[k]) / 2.0)
             place |= {"distance_std_m": float(cars.distance_std[k]), "position_std_m": spread}

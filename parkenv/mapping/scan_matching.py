@@ -71,7 +71,7 @@ Located = FloatArray | Callable[[Sequence[RangeScan]], FloatArray]
 """A pose, or what `PerceptionPipeline.process` asks for it."""
 
 
-def make_locate(name: str, lot: ParkingLot) -> Callable[[FloatArray], Located]:
+def make_locate(name: str, lot: ParkingLot | None) -> Callable[[FloatArray], Located]:
     """Return a function that is called with the odometry of each capture of a drive, in order."""
     require_one_of("localise", name, LOCALISERS)
     if name == "none":
@@ -81,10 +81,10 @@ def make_locate(name: str, lot: ParkingLot) -> Callable[[FloatArray], Located]:
 
 
 class ScanMatcher:
-    """Follows a car through one drive, past the walls and slots of a lot."""
+    """Follows a car through one drive, past the walls and slots of a lot, if there is one."""
 
-    def __init__(self, lot: ParkingLot) -> None:
-        self._edges = _lot_edges(lot)
+    def __init__(self, lot: ParkingLot | None) -> None:
+        self._edges = _NO_EDGES if lot is None else _lot_edges(lot)
         self._recent: list[FloatArray] = []
         self._odometry: FloatArray | None = None
         # Where the car is by the first fit alone, and by both with its covariance.
@@ -199,6 +199,9 @@ class _Edges(NamedTuple):
     length: FloatArray  # (n,) m
     sd: FloatArray  # (n,) m
     two_sided: NDArray[np.bool_]  # (n,)
+
+
+_NO_EDGES = _Edges(*np.zeros((3, 0, 2)), *np.zeros((2, 0)), np.zeros(0, np.bool_))
 
 
 def _lot_edges(lot: ParkingLot) -> _Edges:

@@ -83,7 +83,9 @@ class MapStore:
         # Adding 0 turns -0.0 into 0.0.
         digest = hashlib.sha256((np.round(poses, 3) + 0.0).tobytes()).hexdigest()[:16]
         about = {"lot": lot.name, "digest": digest}
-        self._file = RowFile(path, "map file", "parkenv survey", create=create, about=about, views=[_SIGHTINGS])
+        self._file = RowFile(
+            path, "map file", "parkenv survey", create=create, about=about, views=[_SIGHTINGS]
+        )
         head = self._file.head
         if head.get("digest") != about["digest"]:
             self.close()

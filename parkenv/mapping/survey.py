@@ -236,7 +236,10 @@ class SessionMap:
         self.cars: list[FloatArray] = []
 
     def add(self, captured: TimedCapture, odometry: FloatArray) -> PerceptionResult:
-        result = self._pipeline.process(captured, self.slots, self._locate(odometry))
+        return self.record(self._pipeline.process(captured, self.slots, self._locate(odometry)))
+
+    def record(self, result: PerceptionResult) -> PerceptionResult:
+        """Add what was located in a capture to the grid and to the cars."""
         for view in result.views:
             _update_grid(self.grid, view, result.vehicle)
             self.cars.append(view.cars.poses)

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -60,13 +60,22 @@ from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, Turn, is_buildi
 LOT_VERSION = 1
 
 
-def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None = None) -> None:
+def write_lot(
+    lot: ParkingLot,
+    path: str | Path,
+    provenance: Provenance | None = None,
+    *,
+    members: Mapping[str, Any] | None = None,
+    of_slots: Sequence[Mapping[str, Any]] = (),
+) -> None:
     """Write a lot as native GeoJSON, atomically; `read_lot` restores it exactly.
 
     Args:
         lot: the lot.
         path: the file.
         provenance: what an import guessed, kept in the member `import`.
+        members: further members of the file, which readers of lots pass over.
+        of_slots: further properties of each slot.
     """
     path = Path(path)
     _check_suffix(path)
@@ -82,8 +91,12 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
         head["import"] = provenance.document()
     if lot.zone_rules:
         head["zones"] = {name: zone_document(zone) for name, zone in lot.zone_rules.items()}
-    features = ",\n".join(json.dumps(feature) for feature in _features(lot))
-    write_text(path, f'{json.dumps(head)[:-1]},\n"features": [\n{features}\n]}}\n')
+    head |= members or {}
+    features = [*_features(lot)]
+    for feature, properties in zip(features, of_slots, strict=False):  # slots come first
+        feature["properties"] |= properties
+    lines = ",\n".join(map(json.dumps, features))
+    write_text(path, f'{json.dumps(head)[:-1]},\n"features": [\n{lines}\n]}}\n')
 
 
 def check_lot_output(path: Path) -> None:
