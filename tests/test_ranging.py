@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError
 from parkenv.lots import packaged_lot
 from parkenv.mapping.route import survey_route
 from parkenv.perception.box_fit import fit_box
@@ -26,7 +25,7 @@ from parkenv.perception.ranging import (
 from parkenv.world.lot_scene import slot_lot
 from sim_sensors.ground_truth import View, vehicle_boxes
 from sim_sensors.laser.footprints import ScanPlane
-from sim_sensors.rig import Mount, SensorRig, poses_along
+from sim_sensors.rig import SensorRig, poses_along
 
 ORIGIN = np.zeros(3)
 RIG = SensorRig.thesis()

@@ -201,7 +201,9 @@ class _Edges(NamedTuple):
     two_sided: NDArray[np.bool_]  # (n,)
 
 
-_NO_EDGES = _Edges(*np.zeros((3, 0, 2)), *np.zeros((2, 0)), np.zeros(0, np.bool_))
+_NO_EDGES = _Edges(
+    np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_)
+)
 
 
 def _lot_edges(lot: ParkingLot) -> _Edges:

@@ -102,7 +102,7 @@ def _scenario_of(drive: RecordedDrive) -> Scenario:
     name = drive.head.key.partition("/")[0] if drive.head else ""
     if name not in SCENARIO_NAMES:
         raise InputError(
-            f"{drive.path}: is of no known lot; want --lot FILE with its slots, or --discover to find them"
+            f"{drive.path}: was not made by parkenv survey; want --lot FILE with its slots, or --discover to find them"
         )
     return make_scenario(name)
 
