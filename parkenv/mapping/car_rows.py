@@ -38,7 +38,7 @@ def car_rows(cars: ParkedCars, path: shapely.MultiLineString) -> list[CarRow]:
     step = cars.xy[None] - cars.xy[:, None]
     away = np.stack([(step * axis_of(middle + quarter)).sum(axis=2) for quarter in (0.0, math.pi / 2)])
     alike = np.abs(_turn((cars.yaw - heading)[None] - (cars.yaw - heading)[:, None])) < _ALIKE
-    linked = (np.abs(away) <= np.array(LINK_M)[:, None, None]).all(axis=0) & alike & (np.abs(turn) < 1.0)
+    linked = (np.abs(away) <= np.array(LINK_M)[:, None, None]).all(axis=0) & alike & (np.abs(turn) < _ALIKE)
     one, other = np.nonzero(np.triu(linked, 1))
     segments = np.asarray(shapely.linestrings(np.stack([cars.xy[one], cars.xy[other]], axis=1)))
     crossing = shapely.intersects(segments, path) if len(one) else np.zeros(0, np.bool_)

@@ -138,6 +138,8 @@ def _fitted(lanes: Sequence[Lane], slots: Slots) -> list[Lane]:
     shapes = np.array([shapely.LineString(lane.points) for lane in lanes])
     for i, (lane, opens) in enumerate(zip(lanes, is_open, strict=True)):
         others = shapely.MultiLineString(np.delete(shapes, i).tolist())
+        # An end near another lane is a junction that the drive has not passed.
+        opens = opens & ~shapely.dwithin(others, shapely.points(lane.points[[0, -1]]), SLOT_REACH)
         points = _shifted(lane.points, mouths, opens)
         for is_last in np.flatnonzero(opens).tolist():
             points = points if is_last else points[::-1]
@@ -146,8 +148,7 @@ def _fitted(lanes: Sequence[Lane], slots: Slots) -> list[Lane]:
             way = (points[-1] - back) / np.hypot(*(points[-1] - back))
             ahead, aside = np.stack([way, [-way[1], way[0]]]) @ (mouths - points[-1]).T
             further = ahead[(ahead > 1.0) & (ahead < _AHEAD_M) & (np.abs(aside) < SLOT_REACH)]
-            # An end near another lane is a junction that the drive has not passed.
-            if len(further) and not others.dwithin(shapely.Point(points[-1]), SLOT_REACH):
+            if len(further):
                 points = np.concatenate([points, [points[-1] + further.max() * way]])
             points = points if is_last else points[::-1]
         fitted.append(Lane(points, lane.oneway))

@@ -80,8 +80,8 @@ def discover_street(
     if len(cars.xy):
         cars = _same_cars_joined(aligned(cars, car_rows(cars, path)))
     rows = car_rows(cars, path)
-    # What is seen once may have moved, and a car alone at an angle to the street is hardly parked, or no car.
-    rows = [row for row in rows if (cars.sightings[row.members] > 1).any()]
+    # What is seen once may have moved, unless it is in line with others; a car alone at an angle is hardly parked.
+    rows = [row for row in rows if len(row.members) > 2 or (cars.sightings[row.members] > 1).any()]
     rows = [row for row in rows if len(row.members) > 1 or row.angle in (0.0, math.pi / 2)]
     found = [_slots_of(cars, row, path, is_free) for row in rows]
     none = StreetSlots(NO_SLOTS, np.empty(0, np.str_), np.empty(0, np.int64), np.empty(0))
