@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from parkenv.errors import InputError
 from parkenv.mapping.car_tracks import CAR_LENGTH, CarTracks
 from parkenv.perception.detector import Detections
+from parkenv.perception.ground_detector import GroundDetector
 from parkenv.perception.pipeline import CameraView
 from parkenv.perception.range_scan import RangeScan
 from parkenv.perception.ranging import LocatedCars, localize_cars
@@ -129,3 +131,17 @@ def test_what_hides_from_the_other_point_is_left_out_of_a_scan():
     assert len(moved.angle) < len(angle)
     near = moved.points(np.flatnonzero(moved.distance < 5.0))
     assert np.allclose(np.hypot(*near.T), 3.0)
+
+
+def test_a_calibrated_camera_sees_no_cars_in_the_sky_or_on_its_own_bonnet():
+    class Four:
+        def detect(self, image):
+            boxes = [[10, 190, 110, 245], [10, 10, 110, 60], [200, 330, 500, 479], [300, 190, 639, 479]]
+            return Detections(np.array(boxes, float), np.full(4, 0.9, np.float32))
+
+    camera = PinholeCamera.from_field_of_view(640, 480, math.radians(90.0))
+    ground = GroundDetector(Four(), camera, Mount(z=1.3))
+    found = ground.detect(np.zeros((480, 640, 3), np.uint8))
+    assert found.boxes[:, 0].tolist() == [300.0]  # the near car
+    with pytest.raises(InputError, match="want 640×480 as calibrated"):
+        ground.detect(np.zeros((48, 64, 3), np.uint8))

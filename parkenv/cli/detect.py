@@ -66,6 +66,12 @@ class Detect(Command):
         takes="NAME|FILE|MODULE:CLASS",
         default="none",
     )
+    calibration: Path | None = option(
+        None,
+        "The camera (.toml, as of map-drive), so that only cars on the ground are reported: no sky, no own bonnet.",
+        takes="FILE",
+        default="none",
+    )
     threshold: float = option(0.5, "Smallest probability of a reported car.", takes="P", gt=0, lt=1)
     least_height: float | None = option(
         None, "Height of the smallest regions searched, px.", takes="PX", default="the model's", ge=8
@@ -83,7 +89,9 @@ class Detect(Command):
 
         console = make_console()
         with stages(console, "frames") as progress:
-            cars = find_cars(self.images, self._finder(), self.threshold, self.step, self.out, progress)
+            cars = find_cars(
+                self.images, self._on_ground(self._finder()), self.threshold, self.step, self.out, progress
+            )
         boxes = [box for box in cars.boxes if box["frame"] is None]
         if cars.images:
             print_rows(console, "Cars", boxes, [column.key for column in BOX], BOX)
@@ -104,6 +112,14 @@ class Detect(Command):
             ]
             save_summary(self.out, None, rows, videos=cars.videos, not_searched=cars.not_searched)
             console.print(f"Pictures, films, boxes.csv and summary.json are in {self.out}")
+
+    def _on_ground(self, detector: Detector) -> Detector:
+        if self.calibration is None:
+            return detector
+        from parkenv.mapping.drive_calibration import DriveCalibration
+        from parkenv.perception.ground_detector import GroundDetector
+
+        return GroundDetector(detector, *DriveCalibration.read(self.calibration).only_camera())
 
     def _finder(self) -> Detector:
         from parkenv.perception.detector_registry import make_detector

@@ -10,7 +10,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, naming
 from parkenv.files.spec_file import Several, Spec
 from parkenv.mapping.lenses import Picture, Placed
 from sim_sensors.camera.models import PinholeCamera
@@ -140,3 +140,14 @@ class DriveCalibration(Spec):
     cameras: Several[CameraSpec] = Field((), max_length=16)
     stereo_cameras: Several[StereoSpec] = Field((), max_length=16)
     lasers: Several[LaserSpec] = Field((), max_length=16)
+
+    def only_camera(self) -> tuple[PinholeCamera, Mount]:
+        """Return the camera, or the left one of a stereo pair, and its place on the car."""
+        lenses = (*self.cameras, *self.stereo_cameras)
+        with naming(self._file or "calibration"):
+            if len(lenses) != 1:
+                raise InputError(f"has {len(lenses)} cameras, want the one that took the pictures")
+            picture = lenses[0].picture(lenses[0].width, lenses[0].height)
+            if picture is None:
+                raise InputError("its camera has no numbers, want width, height, fx, fy, cx and cy")
+        return picture.camera, lenses[0].mount.placed().mount

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -20,14 +19,12 @@ from parkenv.perception.detector import (
     Detections,
     Detector,
     DetectorErrors,
-    GroundBand,
 )
 from parkenv.perception.detector_registry import make_detector
+from parkenv.perception.ground_detector import ground_band
 from parkenv.perception.monocular import GroundView, RangingErrors, localize_boxes
 from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
 from parkenv.perception.ranging import (
-    CAR_HEIGHT,
-    OFF_GROUND,
     LocatedCars,
     localize_cars,
     localize_disparity,
@@ -228,9 +225,7 @@ class PerceptionPipeline:
         """Find the cars; a detector that can do so looks only where a car on the ground can be."""
         if not isinstance(self.detector, BandDetector):
             return self.detector.detect(image)
-        horizon = camera.cy + camera.fy * math.tan(mount.pitch)
-        band = GroundBand.of(horizon, mount.z, OFF_GROUND, CAR_HEIGHT, CAR_HEIGHT[0] + OFF_GROUND)
-        return self.detector.detect_on_ground(image, band)
+        return self.detector.detect_on_ground(image, ground_band(camera, mount))
 
     def _disparities(self, capture: Capture) -> dict[str, tuple[StereoCamera, NDArray[np.float32]]]:
         return {
