@@ -21,14 +21,14 @@ from parkenv.perception.pipeline import CameraView
 from parkenv.perception.ranging import LocatedCars
 
 CAR_LENGTH = 4.1  # m, of cars whose ends have not both been seen: between KITTI's mean of 3.9 and today's 4.3
-LONGEST, WIDEST = 6.0, 2.4  # m; what is longer is a wall or a hedge
+LONGEST, WIDEST = 5.5, 2.4  # m; what is longer is a wall or a hedge
 LEAST_PROBABILITY = 0.5  # of a car that is listed
 _GATE = (2.6, 1.3)  # m along and across a car within which a sighting is of it
 _SPREADS = 3.0  # standard deviations of a sighting from one picture, within which it is of a car
 _OVERLAP = (2.8, 1.3)  # m along and across, between the middles of two cars that cannot both be there
 _SHARE = 0.6  # weight of a sighting as evidence that there is a car: boxes of one thing resemble
 _UNPLACED_M = 1.5  # m; sightings from pictures with a larger standard deviation say too little
-_MOVED_M = 1.5  # m between the first and the last third of a car's sightings, beyond which it was on its way
+_MOVED_M = 2.2  # m between the first and the last third of a car's sightings, beyond which it was on its way
 _WHOLE_LENGTH, _WHOLE_WIDTH = 3.3, 1.5  # m, sides seen so far are seen from end to end
 _AGREED_M = 0.15  # m; end points of sightings this close agree
 _EDGES = (3.0, 97.0)  # percentiles of the end points where a car's sides are
@@ -122,8 +122,8 @@ class _Track:
 
     @property
     def has_moved(self) -> bool:
-        third = max(len(self.xy) // 3, 1)
-        first, last = np.median(self.xy[:third], axis=0), np.median(self.xy[-third:], axis=0)
+        third, xy = max(len(self.xy) // 3, 1), np.array(self.xy)[np.argsort(self.times, kind="stable")]
+        first, last = np.median(xy[:third], axis=0), np.median(xy[-third:], axis=0)
         return len(self.xy) >= 3 and math.dist(first, last) > _MOVED_M
 
     def take(self, other: _Track) -> None:
