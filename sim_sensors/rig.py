@@ -62,6 +62,17 @@ class Mount:
         cosine, sine = math.cos(yaw), math.sin(yaw)
         return x + cosine * self.x - sine * self.y, y + sine * self.x + cosine * self.y, yaw + self.yaw
 
+    def tilted(self, roll: float, pitch: float) -> Mount:
+        """Return the mount above the road of a vehicle that rolls to the right and pitches upwards, rad.
+
+        Examples:
+            >>> Mount(yaw=RIGHT).tilted(roll=0.02, pitch=0.01).pitch
+            -0.02
+        """
+        if not roll and not pitch:
+            return self
+        return replace(self, pitch=self.pitch + pitch * math.cos(self.yaw) + roll * math.sin(self.yaw))
+
     def camera_pose(self, vehicle: FloatArray) -> FloatArray:
         """Return the camera-to-world matrix, (4, 4), of a camera at this mount, for a vehicle at (3,) x, y, yaw."""
         x, y, yaw = self.in_world(vehicle)

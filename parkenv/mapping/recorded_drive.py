@@ -450,7 +450,11 @@ def map_drive(
     called after every capture.
     """
     require_ranges(drive, localise)
-    mapped = SessionMap(PerceptionPipeline(drive.rig, lot, detector, drive.errors), lot, localise)
+    mapped = SessionMap(
+        PerceptionPipeline(drive.rig, lot, detector, drive.errors, on_streets=drive.head is None),
+        lot,
+        localise,
+    )
     captures = drive.captures(every)
     return mapped_drive(drive, lot, mapped, ((mapped.add(*one), one[1]) for one in captures), on_frame)
 

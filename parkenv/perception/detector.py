@@ -100,9 +100,15 @@ class DetectorErrors(NamedTuple):
     """
 
     missed: float = 0.05  # fraction of cars that are whole in a picture and hidden by no box
+    missed_on_streets: float = 0.15  # the same in pictures of real streets (KITTI, 6 to 15 m)
     # mean and standard deviations, fractions of the car's height in the image
     shift: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     std: tuple[float, float, float, float] = (0.06, 0.04, 0.06, 0.045)
+
+    @property
+    def on_streets(self) -> DetectorErrors:
+        """Those in pictures of real streets."""
+        return self._replace(missed=self.missed_on_streets)
 
     def corrected(self, boxes: NDArray[np.floating]) -> NDArray[np.float64]:
         shift = np.array(self.shift)

@@ -92,6 +92,7 @@ class PerceptionPipeline:
         lot: the lot with the slots; None: cars are located only.
         detector: a detector, or its name (see `make_detector`); None: the packaged HOG detector.
         errors: of poses and mount, where distances follow from boxes; those of the boxes are the detector's own.
+        on_streets: whether the pictures are of real streets, of which detectors miss more cars.
 
     Raises:
         InputError: a rig without a camera, or an unknown detector.
@@ -103,6 +104,8 @@ class PerceptionPipeline:
         lot: ParkingLot | None,
         detector: str | Detector | None = None,
         errors: RangingErrors | None = None,
+        *,
+        on_streets: bool = False,
     ) -> None:
         if not (rig.cameras or rig.stereo_cameras):
             raise InputError("the rig has no camera, want at least one")
@@ -110,7 +113,7 @@ class PerceptionPipeline:
         self.lot = lot
         self.detector = make_detector(detector)
         own = getattr(self.detector, "errors", DetectorErrors())
-        self.errors = (errors or RangingErrors())._replace(detector=own)
+        self.errors = (errors or RangingErrors())._replace(detector=own.on_streets if on_streets else own)
         # Only these promise that they may be called in several threads.
         self._concurrent = isinstance(self.detector, BandDetector)
 
@@ -251,11 +254,15 @@ class PerceptionPipeline:
         }
 
     def _images(self, capture: Capture) -> list[tuple[str, PinholeCamera, Mount, NDArray[np.uint8]]]:
+        tilt = capture.tilt
         return [
-            *((name, camera, mount, capture.images[name].image) for name, camera, mount in self.rig.cameras),
             *(
-                (name, stereo.camera, mount, capture.pairs[name].left.image)
-                for name, stereo, mount in self.rig.stereo_cameras
+                (name, camera, m.tilted(*tilt), capture.images[name].image)
+                for name, camera, m in self.rig.cameras
+            ),
+            *(
+                (name, stereo.camera, m.tilted(*tilt), capture.pairs[name].left.image)
+                for name, stereo, m in self.rig.stereo_cameras
             ),
         ]
 

@@ -29,6 +29,7 @@ MOST_LOG_ODDS = 4.0  # bound of a slot's log-odds: a car that arrives or leaves 
 PARKING_SPREAD_M = (0.35, 0.2)  # standard deviation of a parked car's place along and across its slot, m
 CLUTTER_DENSITY = 0.01  # cars outside slots, 1/m²: traffic, and boxes without a car
 LEAST_ASSIGNMENT = 0.5  # probability that an observation is of a slot, from which it counts
+MOST_MISSED = 0.4  # of cars, by a detector whose silence says nothing: misses of one car resemble one another
 VIEW_REACH_M = 12.0  # m, up to which a slot without a car in the picture is held to be free
 _CANDIDATES = 8  # slots that a car may stand in
 _FREE_LOG_ODDS = 0.5  # against taken, from which a slot is known to be free
@@ -163,7 +164,7 @@ class SlotFilter:
         """
         x, y, yaw = ground.mount.in_world(vehicle)
         near = self._slots_near(x, y, VIEW_REACH_M)
-        if not len(near):
+        if not len(near) or errors.detector.missed > MOST_MISSED:
             return
         # Corners of a usual car in each slot, ahead and to the right of the camera.
         to_x, to_y = (self.lot.slot_xy[near] - [x, y]).T

@@ -129,7 +129,7 @@ def _located(
     drive: RecordedDrive, detector: Detector, every: float, localise: str, progress: Progress
 ) -> _Located:
     require_ranges(drive, localise)
-    pipeline = PerceptionPipeline(drive.rig, None, detector, drive.errors)
+    pipeline = PerceptionPipeline(drive.rig, None, detector, drive.errors, on_streets=drive.head is None)
     locate, results = make_locate(localise, None), []
     on_frame = counted(progress, "Locating cars")
     for captured, recorded in drive.captures(every):
