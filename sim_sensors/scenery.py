@@ -1,4 +1,4 @@
-"""Meshes of scenery: buildings, walls, trees, pedestrians."""
+"""Meshes of scenery: buildings, walls, hedges, trees, pedestrians."""
 
 from __future__ import annotations
 
@@ -184,6 +184,26 @@ def _add_bar(
     after = [1, 2, 3, 0]
     build.quads(np.stack([low, low[after], high[after], high], axis=1), part)
     build.quads(np.stack([high, low[::-1]]) if levels[0] > 0 else high[None], part)
+
+
+def hedge_mesh(start: ArrayLike, end: ArrayLike, height: float, thickness: float, seed: int) -> Mesh:
+    """Make a clipped hedge, uneven by up to a tenth; its centre line runs from start to end, (2,) m each."""
+    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    rng, length = np.random.default_rng([seed, 15]), float(np.hypot(*(b - a)))
+    across = 0.5 * thickness * np.array([-0.9, -1.0, -0.95, -0.7, 0.7, 0.95, 1.0, 0.9])
+    up = height * np.array([0.0, 0.45, 0.9, 1.0, 1.0, 0.9, 0.45, 0.0])
+    u = np.concatenate([[0.0], np.linspace(0.0, length, 2 + int(length / 0.4)), [length]])
+    rough = rng.uniform(-0.1, 0.1, (2, len(u), len(up))) * min(height, thickness)
+    rough[:, [0, 1, -2, -1]] = 0.0
+    y, z = across + rough[0], np.where(up > 0.0, up + rough[1], 0.0)
+    y[[0, -1]], z[[0, -1]] = 0.0, 0.5 * height  # both ends are closed
+    along = (b - a) / length
+    flat = a + u[:, None, None] * along + y[..., None] * np.array([-along[1], along[0]])
+    build = ShapeBuilder()
+    dark = np.where(rng.random((len(u) - 1, len(up) - 1)) < 0.4, _Part.LEAVES_DARK, _Part.LEAVES)
+    build.grid(np.concatenate([flat, z[..., None]], axis=-1), dark)
+    green = np.array([62.0, 80.0, 44.0]) + rng.uniform(-16, 16, 3)
+    return _made(build, {_Part.LEAVES: green, _Part.LEAVES_DARK: 0.8 * green})
 
 
 def tree_mesh(height: float, seed: int) -> Mesh:

@@ -18,6 +18,7 @@ from sim_sensors.mesh import Ground, Mesh
 TREE_KINDS = 8
 LOW_WALL_M = 0.5  # the laser passes over lower walls
 WALL_THICKNESS_M = 0.24
+HEDGE_THICKNESS_M = 0.8
 
 
 class Standing(NamedTuple):
@@ -30,7 +31,7 @@ class Standing(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Ground, buildings, walls, trees and people; world frame, SI units.
+    """Ground, buildings, walls, hedges, trees and people; world frame, SI units.
 
     Args:
         paved: polygons, (k, 2) m, of asphalt.
@@ -41,10 +42,11 @@ class Surroundings:
         trees: (n, 3) m: x, y, height.
         pedestrians: (n, 4): x, y in m, yaw in rad, phase of the stride in turns.
         seed: 0 or more, seed of textures, trees, clothes and windows.
+        hedges: (n, 5) m: both ends of hedges, and their height.
 
     Raises:
-        SensorError: a shape is wrong, a value is not finite, a height or width is not above zero, or a wall has no
-        length.
+        SensorError: a shape is wrong, a value is not finite, a height or width is not above zero, or a wall or
+        hedge has no length.
     """
 
     paved: Sequence[ArrayLike] = ()
@@ -55,11 +57,12 @@ class Surroundings:
     trees: ArrayLike = ()
     pedestrians: ArrayLike = ()
     seed: int = 0
+    hedges: ArrayLike = ()
     _outlines: tuple[FloatArray, ...] = field(init=False, repr=False, default=())
 
     def __post_init__(self) -> None:
         require_seed(self.seed)
-        tables = {"markings": 5, "walls": 5, "trees": 3, "pedestrians": 4}
+        tables = {"markings": 5, "walls": 5, "hedges": 5, "trees": 3, "pedestrians": 4}
         for name, columns in tables.items():
             object.__setattr__(self, name, as_floats(name, getattr(self, name), None, columns))
         for name in ("paved", "buildings"):
@@ -77,7 +80,7 @@ class Surroundings:
         for name, column, low in least_values:
             if (column < low).any():
                 raise SensorError(f"{name} is {column.min()}, want heights of {low} m or more")
-        for name in ("markings", "walls"):
+        for name in ("markings", "walls", "hedges"):
             table = self._table(name)
             what = "width" if name == "markings" else "height"
             if (table[:, 4] <= 0).any():
@@ -115,6 +118,9 @@ class Surroundings:
                 [0, 0], [x1 - x0, y1 - y0], height + 0.002 * (i % 4), WALL_THICKNESS_M, self.seed
             )
             things.append(Standing(mesh, (x0, y0, 0.0)))
+        for i, (x0, y0, x1, y1, height) in enumerate(self._table("hedges").tolist()):
+            mesh = scenery.hedge_mesh([0, 0], [x1 - x0, y1 - y0], height, HEDGE_THICKNESS_M, self.seed + i)
+            things.append(Standing(mesh, (x0, y0, 0.0)))
         trees = self._table("trees")
         kinds: dict[tuple[float, int], Mesh] = {}
         for i, (x, y, height) in enumerate(trees.tolist()):
@@ -131,17 +137,18 @@ class Surroundings:
 
     @cached_property
     def wall_segments(self) -> FloatArray:
-        """Line segments of buildings and walls 0.5 m above the ground, (m, 2, 2) float64, m.
+        """Line segments of buildings, walls and hedges 0.5 m above the ground, (m, 2, 2) float64, m.
 
-        A free-standing wall has both faces and both ends.
+        A free-standing wall or hedge has both faces and both ends.
         """
         sides = [np.stack([a, np.roll(a, -1, axis=0)], axis=1) for a in self._outlines]
-        for x0, y0, x1, y1, height in self._table("walls").tolist():
-            if height <= LOW_WALL_M:
-                continue
+        walls, hedges = self._table("walls"), self._table("hedges")
+        thick = np.repeat([WALL_THICKNESS_M, HEDGE_THICKNESS_M], [len(walls), len(hedges)])
+        long = np.column_stack([np.concatenate([walls, hedges]), thick])
+        for x0, y0, x1, y1, _, thickness in long[long[:, 4] > LOW_WALL_M].tolist():
             a, b = np.array([x0, y0]), np.array([x1, y1])
             along = (b - a) / np.hypot(*(b - a))
-            side = 0.5 * WALL_THICKNESS_M * np.array([-along[1], along[0]])
+            side = 0.5 * thickness * np.array([-along[1], along[0]])
             ring = np.array([a - side, b - side, b + side, a + side])
             sides.append(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
         return np.concatenate(sides) if sides else np.empty((0, 2, 2))

@@ -12,13 +12,15 @@ from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.scene import Scene
 from sim_sensors.scenery import (
     building_mesh,
+    hedge_mesh,
     pedestrian_footprint,
     pedestrian_mesh,
     tree_mesh,
     wall_mesh,
 )
+from sim_sensors.mesh import Material
 from sim_sensors.slot_scenes import ParkingManners, SlotLot, scene_of_slots
-from sim_sensors.surroundings import Surroundings
+from sim_sensors.surroundings import HEDGE_THICKNESS_M, Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
 
 AROUND = {
@@ -96,6 +98,19 @@ def test_footprints_are_where_the_vehicles_stand():
     assert len(prints.walls) == 4 + 4
     plane = ScanPlane(prints.corners, prints.n_corners, prints.walls, prints.ids)
     assert plane.n_footprints == 5
+
+
+def test_hedges_are_drawn_and_met_by_the_laser():
+    around = Surroundings(hedges=[[2, -3, 2, 3, 1.2], [-4, -3, -4, 3, 0.4]])
+    assert len(around.standing) == 2
+    scene = Scene.from_arrays(np.empty((0, 3)), [], surroundings=around)
+    walls = scene.footprints().walls
+    assert len(walls) == 4  # the low one is passed over
+    assert walls[..., 0].min() == pytest.approx(2 - HEDGE_THICKNESS_M / 2)
+    mesh = around.standing[0].mesh
+    assert (mesh.material == Material.FOLIAGE).all()
+    assert np.ptp(mesh.vertices[:, 2]) == pytest.approx(1.2, abs=0.1)
+    assert np.abs(mesh.vertices[:, 0]).max() == pytest.approx(HEDGE_THICKNESS_M / 2, abs=0.1)
 
 
 def test_changing_one_slot_leaves_every_other_array_as_it_was():
@@ -217,11 +232,12 @@ def test_a_lot_becomes_a_scene_in_one_call():
     [
         building_mesh([[0, 0], [20, 0], [20, 12], [10, 12], [10, 8], [0, 8]], 9.0, 1),
         wall_mesh([0, 0], [5, 1], 2.0, 0.24, 1),
+        hedge_mesh([0, 0], [5, 1], 1.2, 0.8, 1),
         tree_mesh(7.0, 3),
         pedestrian_mesh(0.0, 1),
         pedestrian_mesh(0.25, 2),
     ],
-    ids=["building", "wall", "tree", "striding", "passing"],
+    ids=["building", "wall", "hedge", "tree", "striding", "passing"],
 )
 def test_scenery_is_turned_the_right_way_round(mesh):
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
@@ -256,6 +272,7 @@ def test_people_have_their_legs_inside_their_footprint():
         (lambda: ParkingManners(nose_out=1.5), "nose_out"),
         (lambda: Surroundings(walls=[[0, 0, 0, 0, 1]]), r"walls\[0\] .*want two ends apart"),
         (lambda: Surroundings(walls=[[0, 0, 3, 0, 0]]), "walls .*want a height above 0"),
+        (lambda: Surroundings(hedges=[[0, 0, 0, 0, 1]]), r"hedges\[0\] .*want two ends apart"),
         (lambda: Surroundings(trees=[[0, 0, 0.2]]), "trees .*want heights"),
         (lambda: Surroundings(buildings=[[[0, 0], [1, 0], [2, 0]]]), "buildings .*want an outline"),
     ],
