@@ -155,10 +155,41 @@ def test_small_pictures_are_enlarged_no_more_than_told(street):
     assert np.allclose(found.boxes, within.boxes - (240, 180, 240, 180), atol=1e-3)
 
 
+def test_the_input_follows_a_pictures_proportions(net, street, monkeypatch):
+    image, truth = street
+    detector, seen = with_settings(net.settings.changed(follow=True, mirror=False, halved_from=None)), []
+    run = detector._run
+    monkeypatch.setattr(detector, "_run", lambda fed: seen.append(fed.shape[:1:-1]) or run(fed))
+    wide = np.ascontiguousarray(image[150:342])  # 640×192
+    for width, height, fed in ((1280, 384, (1024, 320)), (640, 192, (1024, 320)), (320, 96, (640, 192))):
+        found = detector.detect(cv2.resize(wide, (width, height), interpolation=cv2.INTER_AREA))
+        assert seen[-1] == fed
+        sure = found.select(found.probability > 0.4)
+        for box in truth.visible_box - (0, 150, 0, 150):
+            assert max(overlap(b, np.clip(box, 0, (640, 192) * 2) * width / 640) for b in sure.boxes) > 0.6
+    detector.detect(image)
+    assert seen[-1] == (640, 480)
+
+
+def test_cars_that_fill_the_picture_are_looked_for_at_half_the_size(net, monkeypatch):
+    image, truth = drawn([[0.4, 2.9, 0.0], [30.0, 40.0, 0.0], [-30.0, 40.0, 0.0]])
+    once, twice = (with_settings(net.settings.changed(halved_from=n)) for n in (None, 40))
+    seen, run = [], twice._run
+    monkeypatch.setattr(twice, "_run", lambda fed: seen.append(fed.shape[:1:-1]) or run(fed))
+    found, before = twice.detect(image), once.detect(image)
+    assert seen == [(640, 480), (320, 256)]
+    near = truth.visible_box[0]
+    assert max(overlap(box, near) for box in found.select(found.probability > 0.5).boxes) > 0.8
+    small = before.boxes[:, 3] - before.boxes[:, 1] < 40
+    apart = [i for i in np.flatnonzero(small) if overlap(before.boxes[i], near) == 0.0]
+    assert all((found.boxes == before.boxes[i]).all(axis=1).any() for i in apart)  # small ones are as before
+
+
 def test_small_pictures_are_looked_at_mirrored_too(net, street):
-    small = np.ascontiguousarray(cv2.resize(street[0], (288, 216), interpolation=cv2.INTER_AREA)[:200])
+    small = np.ascontiguousarray(cv2.resize(street[0], (200, 150), interpolation=cv2.INTER_AREA)[:140])
+    net = with_settings(net.settings.changed(halved_from=None))
     found, other = net.detect(small), net.detect(np.ascontiguousarray(small[:, ::-1]))
-    turned = other.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (288, 0, 288, 0)
+    turned = other.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (200, 0, 200, 0)
     sure = np.flatnonzero(found.probability > 0.3)
     assert len(sure) >= 3
     for i in sure:

@@ -9,6 +9,7 @@ from shapely.geometry import LineString, Polygon
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
+from sim_sensors.mesh import Material
 from sim_sensors.scene import Scene
 from sim_sensors.scenery import (
     building_mesh,
@@ -18,7 +19,6 @@ from sim_sensors.scenery import (
     tree_mesh,
     wall_mesh,
 )
-from sim_sensors.mesh import Material
 from sim_sensors.slot_scenes import ParkingManners, SlotLot, scene_of_slots
 from sim_sensors.surroundings import HEDGE_THICKNESS_M, Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 import subprocess
 import sys
@@ -50,6 +51,10 @@ _passed: dict[tuple[str, tuple[int, ...]], tuple[int, int]] = {}
 _COCO = {1: (0,), 80: (2, 5, 7)}  # cars by the number of classes: the only one, or COCO's car, bus and truck
 _BORDER = 114  # grey level around an image in the input
 _CENTER_NUMBERS = 9
+_STEP, _LONGEST = (
+    32,
+    4096,
+)  # px, of an input that follows the image: a side is a multiple of the one, at most the other
 # A tensor whose numbers are in another file has an entry with the key `location`, its field 1, a text of 8 bytes; a
 # protobuf may write either number with more bytes than it needs.
 _ELSEWHERE = re.compile(rb"(?:\x0a|\x8a\x80*\x00)(?:\x08|\x88\x80*\x00)location")
@@ -79,6 +84,18 @@ class OnnxSettings(Spec):
     std: float = Field(255.0, gt=0.0, le=1_000.0, description="Each channel is divided by it.")
     enlarge: float = Field(
         1_000.0, gt=0.0, le=1_000.0, description="Largest magnification of a small image in the input."
+    )
+    follow: bool = Field(
+        False,
+        description="Whether the input has each image's proportions instead, at the number of pixels of size and in "
+        "multiples of 32 px; for the layout centers only.",
+    )
+    halved_from: int | None = Field(
+        None,
+        ge=1,
+        le=4096,
+        description="Image and input are also looked at at half the size, for boxes that are at least as many px high "
+        "there: cars so near that they fill the picture. For the layout centers only; by default they are not.",
     )
     mirror: bool = Field(
         False,
@@ -118,12 +135,17 @@ class Candidates(NamedTuple):
     def select(self, rows: NDArray[Any]) -> Candidates:
         return Candidates(*(None if values is None else values[rows] for values in self))  # type: ignore[arg-type]
 
+    def joined(self, others: Candidates) -> Candidates:
+        pairs = zip(self, others, strict=True)
+        return Candidates(*(None if a is None or b is None else np.concatenate([a, b]) for a, b in pairs))  # type: ignore[arg-type]
+
 
 class OnnxDetector:
     """A `Detector` that runs a network, single-threaded, by OpenCV's `dnn`.
 
-    The image is put into the input as large as fits, centred on grey borders. One output of the network has either
-    layout (in the layout yolo, rows of mask coefficients of a second output are no classes):
+    The image is put into the input as large as fits, centred on grey borders; with the setting `follow` the input is
+    made for the image. One output of the network has either layout (in the layout yolo, rows of mask coefficients of a
+    second output are no classes):
 
     - *yolo*, (1, 4 + classes, n): centre, width and height of a box in px of the input, and a score of each class, 0 to
       1, as exports of YOLOv8 and later have it;
@@ -183,29 +205,9 @@ class OnnxDetector:
         return self.__dict__ | {"_net": None}  # read again where it is needed
 
     def detect(self, image: Image) -> Detections:
-        fed, scale, offset = _fed(image, self.settings, self._size)
-        output = self._run(fed)
-        if self._is_centers:
-            if self.settings.mirror and min(offset) > 0.0:
-                # What the network puts out for the mirrored input, left and right exchanged.
-                mirrored = self._run(np.ascontiguousarray(fed[..., ::-1]))
-                output = 0.5 * (output + mirrored[:, [0, 3, 2, 1, *range(4, _CENTER_NUMBERS)], :, ::-1])
-            decoded = decode_centers(output, self._size, self.settings.threshold)
-        else:
-            decoded = decode_yolo(output, self._cars)
-        if not (np.isfinite(decoded.boxes).all() and np.isfinite(decoded.score).all()):
-            raise InputError(f"{self._name}: put out numbers that are not finite, want boxes and scores")
-        if len(decoded.score) and not (decoded.score.min() >= -1e-4 and decoded.score.max() <= 1.0 + 1e-4):
-            raise InputError(
-                f"{self._name}: has scores from {decoded.score.min():.4g} to {decoded.score.max():.4g}, want 0 to 1"
-            )
-        decoded = decoded.select(decoded.score >= self.settings.threshold)
-        decoded = decoded._replace(
-            boxes=((decoded.boxes.astype(np.float64) - np.tile(offset, 2)) / np.tile(scale, 2)).astype(
-                np.float32
-            ),
-            score=np.clip(decoded.score, 0.0, 1.0),
-        )
+        decoded = self._look(image)
+        if self._is_centers and self.settings.halved_from:
+            decoded = decoded.joined(self._look(image, 0.5))
         size = decoded.boxes[:, 2:] - decoded.boxes[:, :2]
         decoded = decoded.select(np.isfinite(decoded.boxes).all(axis=1) & (size > 0.0).all(axis=1))
         decoded = decoded.select(best_boxes(decoded.boxes, decoded.score, self.settings.overlap))
@@ -217,6 +219,30 @@ class OnnxDetector:
             boxes, decoded.score, decoded.end_on, regions=_regions(boxes, decoded.end_on), view=decoded.view,
             visible_fraction=np.clip(decoded.visible, 0.0, 1.0),
         )  # fmt: skip
+
+    def _look(self, image: Image, size: float = 1.0) -> Candidates:
+        """Return the boxes, in px of the image, that the network finds at the usual size or a fraction of it."""
+        fed, scale, offset, is_small = _fed(image, self.settings, self._size, self._is_centers, size)
+        output = self._run(fed)
+        if self._is_centers:
+            if self.settings.mirror and is_small:
+                # What the network puts out for the mirrored input, left and right exchanged.
+                mirrored = self._run(np.ascontiguousarray(fed[..., ::-1]))
+                output = 0.5 * (output + mirrored[:, [0, 3, 2, 1, *range(4, _CENTER_NUMBERS)], :, ::-1])
+            found = decode_centers(output, (fed.shape[3], fed.shape[2]), self.settings.threshold)
+        else:
+            found = decode_yolo(output, self._cars)
+        if not (np.isfinite(found.boxes).all() and np.isfinite(found.score).all()):
+            raise InputError(f"{self._name}: put out numbers that are not finite, want boxes and scores")
+        if len(found.score) and not (found.score.min() >= -1e-4 and found.score.max() <= 1.0 + 1e-4):
+            raise InputError(
+                f"{self._name}: has scores from {found.score.min():.4g} to {found.score.max():.4g}, want 0 to 1"
+            )
+        least = 0 if size == 1.0 else self.settings.halved_from or 0
+        height = found.boxes[:, 3] - found.boxes[:, 1]
+        found = found.select((found.score >= self.settings.threshold) & (height >= least))
+        boxes = (found.boxes.astype(np.float64) - np.tile(offset, 2)) / np.tile(scale, 2)
+        return found._replace(boxes=boxes.astype(np.float32), score=np.clip(found.score, 0.0, 1.0))
 
     def _run(self, fed: Float32Array) -> Float32Array:
         return self._run_all(fed)[self._output]
@@ -354,8 +380,12 @@ def _highest(score: Float32Array, neighbours: NDArray[np.uint8]) -> Float32Array
 
 
 def _fed(
-    image: Image, settings: OnnxSettings, size: tuple[int, int]
-) -> tuple[Float32Array, tuple[float, float], tuple[float, float]]:
+    image: Image, settings: OnnxSettings, size: tuple[int, int], is_centers: bool, part: float
+) -> tuple[Float32Array, tuple[float, float], tuple[float, float], bool]:
+    """Return the input, the image's scale and place in it, and whether it is smaller even as large as it may be.
+
+    With a `part` below 1 all is smaller by it.
+    """
     grey = as_grey(image)  # checks the image
     if settings.channels == "grey":
         image = grey[..., None]
@@ -364,8 +394,14 @@ def _fed(
     elif settings.channels == "bgr":
         image = image[..., ::-1]
     (width, height), (rows, columns) = size, grey.shape
-    ratio = min(width / columns, height / rows, settings.enlarge)
+    largest = min(width / columns, height / rows)
+    follows = is_centers and (settings.follow or part < 1.0)
+    if settings.follow and is_centers:
+        largest = min(math.sqrt(width * height / (columns * rows)), _LONGEST / max(columns, rows))
+    ratio = part * min(largest, settings.enlarge)
     fit = max(1, round(columns * ratio)), max(1, round(rows * ratio))
+    if follows:
+        width, height = (_STEP * math.ceil(n / _STEP) for n in fit)
     left, top = (width - fit[0]) // 2, (height - fit[1]) // 2
     resized = np.ascontiguousarray(image)
     if fit != (columns, rows):
@@ -375,7 +411,8 @@ def _fed(
     fed = (canvas.transpose(2, 0, 1)[None].astype(np.float32) - np.float32(settings.mean)) / np.float32(
         settings.std
     )
-    return np.ascontiguousarray(fed), (fit[0] / columns, fit[1] / rows), (float(left), float(top))
+    scale, offset = (fit[0] / columns, fit[1] / rows), (float(left), float(top))
+    return np.ascontiguousarray(fed), scale, offset, settings.enlarge < largest
 
 
 def _regions(boxes: Float32Array, end_on: NDArray[np.bool_]) -> Float32Array:
