@@ -142,6 +142,7 @@ def test_the_code_of_a_page_and_an_example_run_from_top_to_bottom(name, tmp_path
     write_counts(tmp_path / "car_parks.csv.gz", first=date(2023, 12, 1))
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.syspath_prepend((tmp_path / name).parent)
     # Each core has a test process already: commands work in this one.
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
     monkeypatch.setattr(sys, "argv", [name])
