@@ -221,15 +221,16 @@ def _joined(tracks: Sequence[_Track]) -> list[_Track]:
 def _headings_of_rows(places: Sequence[_Place]) -> list[float | None]:
     """Return the heading that the cars around have for those that stand askew among them; None for the others.
 
-    A wrong fit explains best why one car should.
+    A wrong fit explains best why one car should, of which no whole flank was seen.
     """
     headings: list[float | None] = []
     table = np.array(places).reshape(-1, 6)
-    for k, (x, y, yaw, *_) in enumerate(places):
+    for k, (x, y, yaw, length, *_) in enumerate(places):
         around = (np.hypot(*(table[:, :2] - [x, y]).T) < _ROW_M) & (np.arange(len(places)) != k)
         mean = np.exp(2j * table[around, 2]).mean() if around.sum() >= _ROW_CARS else 0.0
         turn = (np.angle(mean) / 2.0 - yaw + math.pi / 2) % math.pi - math.pi / 2
-        headings.append(float(yaw + turn) if abs(mean) > _ROW_AGREES and abs(turn) > _ASKEW else None)
+        askew = length == CAR_LENGTH and abs(mean) > _ROW_AGREES and abs(turn) > _ASKEW
+        headings.append(float(yaw + turn) if askew else None)
     return headings
 
 
