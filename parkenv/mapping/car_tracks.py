@@ -33,11 +33,7 @@ _WHOLE_LENGTH, _WHOLE_WIDTH = 3.3, 1.5  # m, sides seen so far are seen from end
 _AGREED_M = 0.15  # m; end points of sightings this close agree
 _EDGES = (3.0, 97.0)  # percentiles of the end points where a car's sides are
 _CELL_M = 0.05  # one end point in so large a cell counts
-_ROW_M, _ROW_CARS, _ROW_AGREES = (
-    15.0,
-    3,
-    0.8,
-)  # m around a car in which so many others agree on their headings
+_ROW_M, _ROW_CARS, _ROW_AGREES = 25.0, 3, 0.5  # m around a car in which so many others agree in heading
 _ASKEW = math.radians(10.0)
 _SIGHTING_STD, _PART_STD = (
     (0.25, 0.25),
