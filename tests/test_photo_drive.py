@@ -15,8 +15,8 @@ from PIL import Image
 from parkenv import InputError, make_scenario
 from parkenv.files.tracks import read_track
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.mapping.drive_folders import source_of
 from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.photographs import Photographs
 from parkenv.mapping.recorded_drive import RecordedDrive
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
@@ -257,7 +257,7 @@ def test_pictures_get_their_poses_by_name_by_exif_or_by_rate(tmp_path):
         (by_time, {"clock_offset": 3.0}, [[3.5, 0, 0], [4.5, 0, 0], [5.5, 0, 0], [6.5, 0, 0]]),
         (by_time, {"fps": 2.0}, [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1.5, 0, 0]]),
     ):
-        taken = Photographs(folder, PhotoOptions(poses=poses, fov=70.0, **more))
+        taken = source_of(folder, None, PhotoOptions(poses=poses, fov=70.0, **more), None)
         drive = RecordedDrive(folder, source=taken)
         captures = list(drive.captures())
         np.testing.assert_allclose([pose for _, pose in captures], wanted, atol=1e-9)
@@ -275,7 +275,6 @@ def test_pictures_get_their_poses_by_name_by_exif_or_by_rate(tmp_path):
         ("time,x,y,yaw\n0,0,0,0\n", {"fov": 70.0}, "no Exif time"),
         ("time,x,y,yaw\n0,0,0,0\n", {}, "--calibration or --fov"),
         ("time,x,y\n0,0,0\n1,0,0\n", {"fov": 70.0, "fps": 1.0}, "no headings"),
-        ("time,lat,lon\n0,48,8\n", {"fov": 70.0, "fps": 1.0}, "--origin LAT,LON"),
         ("time,x,y,yaw\n0,0,0,0\n1,0,0,0\n", {"fov": 70.0, "fps": 1.0, "clock_offset": 900.0}, "do their clocks agree"),
     ],
 )  # fmt: skip
@@ -283,7 +282,7 @@ def test_photographs_without_what_they_need_are_refused_in_a_line(tmp_path, pose
     folder = photographs(tmp_path / "photos")
     (folder / "poses.csv").write_text(poses)
     with pytest.raises(InputError, match=names) as caught:
-        RecordedDrive(folder, source=Photographs(folder, PhotoOptions(**options)))
+        RecordedDrive(folder, source=source_of(folder, None, PhotoOptions(**options), None))
     assert "\n" not in str(caught.value)
 
 
@@ -317,4 +316,4 @@ def test_a_drive_is_mapped_from_its_photographs_and_from_a_film_with_a_track(tmp
         seen = ~np.isnan(p)
         assert seen.mean() >= 0.5
         assert ((p > 0.5) == truth)[seen].mean() >= 0.9
-        assert "distance_std_m" in (out / "cars.csv").read_text()
+        assert "distance_std_m" in (out / "sightings.csv").read_text()

@@ -13,11 +13,11 @@ from parkenv import InputError, make_scenario
 from parkenv.files.recordings import footage_in
 from parkenv.files.videos import Video
 from parkenv.mapping.drive_calibration import DriveCalibration
+from parkenv.mapping.drive_folders import source_of
 from parkenv.mapping.drive_poses import pose_of
 from parkenv.mapping.drive_writer import Head, recording
 from parkenv.mapping.laser_scans import common_scanner, scan_of
 from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.photographs import Photographs
 from parkenv.mapping.recorded_drive import RecordedDrive
 from parkenv.mapping.store import MapStore
 from sim_sensors.camera.models import Frame
@@ -318,7 +318,7 @@ def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_pa
     monkeypatch.chdir(tmp_path)
     code = (Path(__file__).parents[1] / "docs/calibration.md").read_text().split("```py\n")[1].split("```")[0]
     exec(compile(code, "calibration.md", "exec"), {})
-    taken = Photographs(tmp_path / "photos", PhotoOptions(fov=90.0))
+    taken = source_of(tmp_path / "photos", None, PhotoOptions(fov=90.0), None)
     photographed = RecordedDrive(tmp_path / "photos", source=taken)
     assert photographed.start == 200_000.0
     back = list(photographed.captures())

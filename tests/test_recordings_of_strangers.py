@@ -13,7 +13,7 @@ from parkenv import InputError
 from parkenv.files.recordings import IMAGE, POSES, SCAN
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.drive_formats import source_of
+from parkenv.mapping.drive_folders import source_of
 from parkenv.mapping.drive_setup import set_up
 from parkenv.mapping.laser_scans import Scan, mirrored, without_motion
 from parkenv.mapping.lenses import Picture, Placed, aligned_pair
@@ -264,6 +264,10 @@ def test_a_foreign_recording_wants_a_lot_that_it_is_near(tmp_path):
         done.stderr.split()
     )
     assert done.returncode == 2
+    done = parkenv(
+        "map-drive", write(tmp_path / "fix", drive()), "--scenario", "mini", "--out", tmp_path / "out"
+    )
+    assert "are in degrees, and the lot in metres; want --origin LAT,LON" in " ".join(done.stderr.split())
     (tmp_path / "car.toml").write_text("origin = { x = 9000.0 }")
     done = parkenv(
         "map-drive",

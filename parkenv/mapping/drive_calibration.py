@@ -55,14 +55,8 @@ class Lens(Spec):
 
     def picture(self, width: int | None, height: int | None) -> Picture | None:
         """Return the pictures of this lens; None if it has no numbers."""
-        numbers = {
-            "width": width,
-            "height": height,
-            "fx": self.fx,
-            "fy": self.fy,
-            "cx": self.cx,
-            "cy": self.cy,
-        }
+        numbers = {"width": width, "height": height}
+        numbers |= {name: getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
         if all(value is None for value in numbers.values()):
             return None
         if missing := [name for name, value in numbers.items() if value is None]:

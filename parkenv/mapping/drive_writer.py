@@ -22,7 +22,7 @@ from parkenv.files.spec_file import Spec
 from parkenv.mapping.survey import Survey
 from sim_sensors.rig import SensorRig, TimedCapture
 
-HEAD, POSE = "/parkenv/drive", "/pose"
+HEAD = "/parkenv/drive"
 RECORDED_MONDAY_S = 1_704_067_200  # 2024-01-01; drives are recorded as if in the week from this Monday on
 _STRING = "std_msgs/msg/String"
 
@@ -36,38 +36,49 @@ class Head(Spec, extra="ignore"):
     weather: str
 
 
+def topics_of(rig: SensorRig) -> dict[str, str]:
+    """Return the topics of a rig's recording: `pose`, `image:NAME:SIDE` and `scan:NAME`."""
+    topics = {f"image:{name}:mono": f"/{name}/image/compressed" for name, _, _ in rig.cameras}
+    for name, _, _ in rig.stereo_cameras:
+        topics |= {f"image:{name}:{side}": f"/{name}/{side}/image/compressed" for side in ("left", "right")}
+    return {"pose": "/pose"} | topics | {f"scan:{name}": f"/{name}/scan" for name, _, _ in rig.lasers}
+
+
 class DriveWriter:
     def __init__(self, writer: Any, rig: SensorRig, store: Any) -> None:
         self._writer, self._rig, self._store, self._last = writer, rig, store, 0
         self._connections: dict[str, Any] = {}
+        self._topics = topics_of(rig) | {"head": HEAD}
 
     def add(self, captured: TimedCapture, vehicle: FloatArray) -> None:
         """Append a capture and the pose of the vehicle by its odometry, (3,)."""
         stamp = RECORDED_MONDAY_S * 10**9 + round(captured.time * 1e9)
         x, y, yaw = (float(v) for v in vehicle)
-        self._send(POSE, POSE_2D, stamp, x=x, y=y, theta=yaw)
+        self._send("pose", POSE_2D, stamp, x=x, y=y, theta=yaw)
         capture = captured.capture
         for name, _, _ in self._rig.cameras:
-            self._send_image(f"/{name}/image/compressed", stamp, capture.images[name].image)
+            self._send_image(f"image:{name}:mono", stamp, capture.images[name].image)
         for name, _, _ in self._rig.stereo_cameras:
-            self._send_image(f"/{name}/left/image/compressed", stamp, capture.pairs[name].left.image)
-            self._send_image(f"/{name}/right/image/compressed", stamp, capture.pairs[name].right.image)
+            self._send_image(f"image:{name}:left", stamp, capture.pairs[name].left.image)
+            self._send_image(f"image:{name}:right", stamp, capture.pairs[name].right.image)
         for name, laser, _ in self._rig.lasers:
             self._send(
-                f"/{name}/scan", SCAN, stamp, header=self._header(stamp, name), angle_min=laser.start,
+                f"scan:{name}", SCAN, stamp, header=self._header(stamp, name), angle_min=laser.start,
                 angle_max=laser.start + (laser.n_beams - 1) * laser.step, angle_increment=laser.step,
                 time_increment=0.0, scan_time=0.0, range_min=0.0, range_max=laser.max_range, ranges=capture.scans[name],
                 intensities=np.zeros(0, np.float32),
             )  # fmt: skip
 
     def close(self, head: Head) -> None:
-        self._send(HEAD, _STRING, self._last, data=json.dumps(head.model_dump()))
+        self._send("head", _STRING, self._last, data=json.dumps(head.model_dump()))
 
-    def _send_image(self, topic: str, stamp: int, image: NDArray[np.uint8]) -> None:
+    def _send_image(self, key: str, stamp: int, image: NDArray[np.uint8]) -> None:
         data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
-        self._send(topic, COMPRESSED_IMAGE, stamp, header=self._header(stamp, topic), format="png", data=data)
+        header = self._header(stamp, self._topics[key])
+        self._send(key, COMPRESSED_IMAGE, stamp, header=header, format="png", data=data)
 
-    def _send(self, topic: str, kind: str, stamp: int, **parts: Any) -> None:
+    def _send(self, key: str, kind: str, stamp: int, **parts: Any) -> None:
+        topic = self._topics[key]
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
         message = self._store.types[kind](**parts)

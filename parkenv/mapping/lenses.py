@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -70,8 +69,7 @@ class Picture:
         """Return these for a camera whose right side is lower, by `roll` rad: its pictures are turned level."""
         if abs(roll) < _LEVEL:
             return self
-        turn = Rotation.from_euler("z", roll).as_matrix() @ self.rotation
-        return Picture(self.size, self.matrix, self.camera, self.distortion, self.fisheye, turn)
+        return replace(self, rotation=Rotation.from_euler("z", roll).as_matrix() @ self.rotation)
 
 
 class Info(NamedTuple):
@@ -84,8 +82,6 @@ class Info(NamedTuple):
     rotation: FloatArray  # (3, 3), of the rectification
     projection: FloatArray  # (3, 4), of rectified pictures
     rectified_size: tuple[int, int]
-    frame: str
-    frame_is_rectified: bool  # whether its frame is the one of rectified pictures
 
     @classmethod
     def of(cls, message: Any) -> Info:
@@ -94,44 +90,26 @@ class Info(NamedTuple):
             for n in "kdrp"
         )
         size = int(message.width), int(message.height)
-        if not (
-            k.size == 9
-            and d.size <= 14
-            and r.size == 9
-            and p.size == 12
-            and all(np.isfinite(a).all() for a in (k, d, r, p))
-        ):
+        sizes_fit = (k.size, r.size, p.size) == (9, 9, 12) and d.size <= 14
+        if not (sizes_fit and np.isfinite(np.concatenate([k, d, r, p])).all()):
             raise InputError("has numbers that are missing or not finite, want k, d, r and p")
         if not (min(size) > 0 and k[0] > 0.0 and k[4] > 0.0):
             raise InputError(f"has the size {size} and focal lengths {k[0]:g}, {k[4]:g}, want them above 0")
         p = p.reshape(3, 4) if p[0] > 0.0 else np.column_stack([k.reshape(3, 3), np.zeros(3)])
         r = r.reshape(3, 3) if r.any() else np.eye(3)
-        model = str(getattr(message, "distortion_model", ""))
-        rectified = getattr(message, "rectified_size", None)
-        return cls(
-            size, k.reshape(3, 3), tuple(d.tolist()), model in _FISHEYE, r, p, rectified or size,
-            message.header.frame_id.strip("/"), rectified is not None,
-        )  # fmt: skip
+        is_fisheye = getattr(message, "distortion_model", "") in _FISHEYE
+        return cls(size, k.reshape(3, 3), tuple(d.tolist()), is_fisheye, r, p, size)
 
-    def is_rectified(self, topic: str) -> bool:
-        """Whether pictures of a topic are, as its name or the principal points say: `kitti2bag` calls them raw."""
-        if re.search(r"(?i)(?:\b|_)rect", topic):
-            return True
+    def picture(self, topic: str) -> Picture:
+        """Return what makes pictures of a topic those of a camera: rectified, unless its name or numbers say they are.
+
+        `kitti2bag` calls rectified pictures raw, but the principal points tell.
+        """
+        camera = PinholeCamera(*self.rectified_size, *_numbers(self.projection))
         off = [np.abs(m[:2, 2] / self.size - 0.5).max() for m in (self.matrix, self.projection)]
-        return bool(off[0] > _OFF_CENTRE > off[1])
-
-    def picture(self, topic: str, aligned: bool) -> tuple[Picture, FloatArray]:
-        """Return what makes its pictures those of a camera, of an `aligned` pair if wanted, and its turn, (3, 3)."""
-        pinhole = PinholeCamera(*self.rectified_size, *_numbers(self.projection))
-        if self.is_rectified(topic):
-            return Picture(self.size, pinhole.matrix, pinhole), np.eye(3)
-        if aligned or self.frame_is_rectified:
-            turn = np.eye(3) if self.frame_is_rectified else self.rotation
-            return Picture(
-                self.size, self.matrix, pinhole, self.distortion, self.fisheye, self.rotation
-            ), turn
-        pinhole = PinholeCamera(*self.size, *_numbers(self.matrix))
-        return Picture(self.size, self.matrix, pinhole, self.distortion, self.fisheye), np.eye(3)
+        if re.search(r"(?i)(?:\b|_)rect", topic) or off[0] > _OFF_CENTRE > off[1]:
+            return Picture(self.size, camera.matrix, camera)
+        return Picture(self.size, self.matrix, camera, self.distortion, self.fisheye, self.rotation)
 
 
 def aligned_pair(
@@ -154,10 +132,7 @@ def aligned_pair(
             f"right_camera is at {translation.tolist()} m, want it right of the left one: x below 0"
         )
     camera = PinholeCamera(*left.size, *_numbers(p1))
-    one, two = (
-        Picture(old.size, old.matrix, camera, old.distortion, rotation=turn)
-        for old, turn in ((left, r1), (right, r2))
-    )
+    one, two = (replace(old, camera=camera, rotation=turn) for old, turn in ((left, r1), (right, r2)))
     return one, two, baseline
 
 
@@ -170,28 +145,25 @@ class Placed(NamedTuple):
 
     mount: Mount
     roll: float
-    frame_z: float | None = None  # m, height in the vehicle's frame, which may be above the road itself
 
     @classmethod
     def of(cls, position: FloatArray, axes: FloatArray) -> Placed:
         """Return the pose of a sensor; `axes`, (3, 3), are its own (ahead, left, up) in the vehicle's, in columns."""
-        yaw, down, roll = (float(v) for v in Rotation.from_matrix(axes).as_euler("ZYX"))
-        x, y, z = (float(v) for v in position)
-        return cls(Mount(x, y, max(z, 1e-3), yaw, -down), roll)
+        yaw, down, roll = Rotation.from_matrix(axes).as_euler("ZYX").tolist()
+        x, y, z = position.tolist()
+        return cls(Mount(x, y, z, yaw, -down), roll)
 
     @property
     def axes(self) -> FloatArray:
-        return np.asarray(
-            Rotation.from_euler("ZYX", [self.mount.yaw, -self.mount.pitch, self.roll]).as_matrix()
-        )
+        turn = Rotation.from_euler("ZYX", [self.mount.yaw, -self.mount.pitch, self.roll])
+        return np.asarray(turn.as_matrix())
 
     def turned(self, rotation: FloatArray) -> Placed:
         """Return the pose of the camera after its pictures were turned by `rotation`, (3, 3)."""
         if np.array_equal(rotation, np.eye(3)):
             return self
-        own = OPTICAL @ rotation.T @ OPTICAL.T
         place = np.array([self.mount.x, self.mount.y, self.mount.z])
-        return Placed.of(place, self.axes @ own)._replace(frame_z=self.frame_z)
+        return Placed.of(place, self.axes @ OPTICAL @ rotation.T @ OPTICAL.T)
 
     def in_vehicle(self, points: Float32Array) -> Float32Array:
         """Turn points, (n, 3) m, of the sensor's frame into the axes of the vehicle; the origin stays the sensor."""
@@ -205,8 +177,3 @@ def camera_axes(axes: FloatArray) -> FloatArray:
     """
     optical = axes @ OPTICAL.T
     return optical if abs(optical[2, 2]) >= abs(axes[2, 2]) else axes
-
-
-def require_level(name: str, roll: float, most_deg: float) -> None:
-    if abs(roll) > math.radians(most_deg):
-        raise InputError(f"{name}: mount.roll is {math.degrees(roll):.1f}, want at most {most_deg:g} degrees")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,28 +20,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError, naming
 from parkenv.files.limited_reading import parse_json
-from parkenv.files.recordings import (
-    COMPRESSED_IMAGE,
-    NAV_FIX,
-    SCAN,
-    TRANSFORMS,
-    Messages,
-    picture_in,
-    stamp_of,
-)
+from parkenv.files.recordings import TRANSFORMS, Messages, open_recording, picture_in, stamp_of
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.mapping.car_tracks import CarTracks, ParkedCars
 from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.drive_poses import PoseReader, PoseTrack, within
-from parkenv.mapping.drive_setup import DriveSetup, set_up
-from parkenv.mapping.drive_sources import Bag, Source
-from parkenv.mapping.drive_writer import HEAD, POSE, RECORDED_MONDAY_S, Head
+from parkenv.mapping.drive_poses import PoseReader, PoseTrack, placed, within
+from parkenv.mapping.drive_setup import set_up, set_up_survey
+from parkenv.mapping.drive_sources import Source
+from parkenv.mapping.drive_writer import HEAD, RECORDED_MONDAY_S, Head
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.laser_scans import Scan, common_scanner, mirrored, scan_of, without_motion
-from parkenv.mapping.lenses import Picture
 from parkenv.mapping.point_clouds import SCANNER, CloudScan, Road, fit_road, points_of, scan_of_cloud
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey import SessionMap
@@ -51,11 +43,14 @@ from parkenv.perception.slot_filter import SlotFilter, SlotStates
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import DAY_S
 from sim_sensors.camera.models import Frame, StereoFrame
-from sim_sensors.laser.scanner import LaserScanner
-from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, TimedCapture
+from sim_sensors.rig import Capture, SensorRig, TimedCapture
 
 PAIR_S, CAMERAS_S, LASER_S = 0.001, 0.1, 0.5
 """Longest times between a picture and what joins it, s: the right picture of a pair, another camera, a laser."""
+CAR_COLUMNS = (
+    "time_s", "x_m", "y_m", "yaw_rad", "length_m", "width_m", "position_std_m", "probability", "sightings",
+    "distance_m", "slot",
+)  # fmt: skip
 FAR_M = 500.0  # farther from the lot are poses of another frame
 _STILL = 1e-3, 1e-4  # m and rad in a scan, below which nothing is to correct
 _NO_DEPTH, _NO_IDS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
@@ -73,11 +68,14 @@ class MappedDrive:
     sightings: list[dict[str, Any]]  # of each car located in a picture: the same, and the time
 
 
-class _Taken(NamedTuple):
-    stamp: int  # ns, of the picture
-    partners: dict[str, int]  # index of the message of each sensor, by key
-    pose: FloatArray
-    again: frozenset[str] = frozenset()  # keys of scans that belong to a picture nearer in time
+class _Matched(NamedTuple):
+    """What joins each picture of the first camera."""
+
+    stamps: IntArray  # (n,) ns
+    poses: FloatArray  # (n, 3) of the vehicle; NaN where there is none
+    is_whole: BoolArray  # (n,) whether there are measurements of all sensors
+    partners: dict[str, IntArray]  # (n,) index of the message of each sensor, by key
+    off: dict[str, IntArray]  # (n,) ns to it
 
 
 @dataclass(eq=False)
@@ -88,7 +86,7 @@ class RecordedDrive:
         path: an MCAP file, a rosbag of ROS 2 (folder, .mcap or .db3) or of ROS 1 (.bag), or what `source` reads.
         calibration: sensors and topics; None where the recording says them itself.
         source: what reads the path, None for a bag; its calibration counts.
-        frame: that of the lot, for poses in degrees; None for one around the first pose.
+        frame: that of the lot, for poses in degrees; None for one around them.
     """
 
     path: Path
@@ -98,58 +96,106 @@ class RecordedDrive:
     rig: SensorRig = field(init=False)
     head: Head | None = field(init=False, default=None)
     poses: FloatArray = field(init=False)  # (n, 3) x, y, yaw in the lot
-    pose_s: FloatArray = field(init=False)  # (n,) s, Unix time relative to `_start`
     errors: RangingErrors | None = field(init=False, default=None)  # of the poses, where they are known
 
     def __post_init__(self) -> None:
-        source = self.source or Bag(self.path)
-        self._source, self.calibration = source, source.calibration or self.calibration
+        source = self._source = self.source or Source(partial(open_recording, self.path))
+        self.calibration, self._is_placed = source.calibration or self.calibration, self.frame is not None
         self._measured: dict[str, list[Scan]] = {}
         self._scans: dict[str, list[NDArray[np.float32]]] = {}
-        self._scanners: dict[str, LaserScanner] = {}
         with source.open() as (topics, messages):
-            is_survey = self.calibration is None and HEAD in topics
-            if is_survey:
-                self._setup = _setup_of_survey(topics)
+            if HEAD in topics:
+                self._read_head(messages)
+            if self.head is not None and self.calibration is None:
+                with naming(self.path):
+                    self._setup = set_up_survey(self.head.rig, topics)
             else:
-                self._setup = set_up(self.path, self.calibration, topics, messages)
-            self._topics = self._setup.topics
-            kind = topics.get(self._topics["pose"], "")
+                self._setup = set_up(self.path, self.calibration, topics, messages, source)
+            kind = topics.get(self._setup.topics.get("pose", ""), "")
             reader = PoseReader(kind, self._setup.tree, self._setup.base, self.frame)
-            self._read(messages, reader)
-            if is_survey and (self.head is None or self.head.rig not in RIG_NAMES):
-                raise InputError(f"{self.path}: {HEAD} names no rig of {', '.join(RIG_NAMES)}")
-            self._finish(reader)
-        self.errors = source.errors
-        self.frame = source.frame or (reader.frame if kind == NAV_FIX else self.frame)
-        if kind == NAV_FIX and reader.std:
-            self.errors = RangingErrors.of_poses(reader.std, 0.0)
+            self._finish(reader, self._read(messages, reader))
+        self.frame = source.frame or reader.frame
+        self.errors = RangingErrors.of_poses(reader.std, 0.0) if reader.std else source.errors
 
-    def _read(self, messages: Messages, reader: PoseReader) -> None:
+    def _read_head(self, messages: Messages) -> None:
+        where = f"{self.path}: {HEAD}"
+        for _, _, message in messages({HEAD}):
+            content = parse_json(message.data, where, finite=True)
+            self.head = Head.parse(content if isinstance(content, dict) else {}, where)
+
+    def _topic(self, key: str) -> str:
+        return self._setup.topics.get(key, f"its {key}s")
+
+    def _read(self, messages: Messages, reader: PoseReader) -> dict[str, list[int]]:
         """Read poses, scans, and the times of all."""
-        wanted = {topic: key for key, topic in self._topics.items()}
-        self._stamps: dict[str, list[int]] = {key: [] for key in self._topics}
-        for topic, recorded, message in messages(
-            {*wanted, HEAD} - ({self._topics["pose"]} if reader.kind in TRANSFORMS else set())
-        ):
-            if topic == HEAD:
-                content = parse_json(message.data, f"{self.path}: {HEAD}", finite=True)
-                self.head = Head.parse(content if isinstance(content, dict) else {}, f"{self.path}: {HEAD}")
-                continue
-            key, stamp = wanted[topic], stamp_of(message, recorded)
-            name = key.partition(":")[2]
-            with naming(f"{self.path}: {topic}: message {len(self._stamps[key]) + 1}"):
+        keys = {topic: key for key, topic in self._setup.topics.items()}
+        found: dict[str, list[int]] = {key: [] for key in keys.values()}
+        wanted = {topic for topic, key in keys.items() if key != "pose" or reader.kind not in TRANSFORMS}
+        for topic, recorded, message in messages(wanted):
+            key, stamp = keys[topic], stamp_of(message, recorded)
+            name, stamps = key.partition(":")[2], found[key]
+            with naming(f"{self.path}: {topic}: message {len(stamps) + 1}"):
                 if key == "pose" and not reader.add(message):
                     continue
                 if key == "imu":
                     reader.add_imu(stamp, message)
                 elif key.startswith("scan:") and name not in self._setup.clouds:
-                    scan = scan_of(message)
-                    hangs = (
-                        math.cos(self._setup.lasers[name].roll) < 0.0 if name in self._setup.lasers else False
-                    )
+                    scan, hangs = scan_of(message), math.cos(self._setup.lasers[name].roll) < 0.0
                     self._measured.setdefault(name, []).append(mirrored(scan) if hangs else scan)
-            self._add_stamp(key, stamp)
+            if stamps and stamp <= stamps[-1]:
+                raise InputError(
+                    f"{self.path}: {topic}: time goes from {stamps[-1] / 1e9:.6f} to {stamp / 1e9:.6f} s at "
+                    f"message {len(stamps) + 1}, want it to rise"
+                )
+            stamps.append(stamp)
+        return found
+
+    def _finish(self, reader: PoseReader, found: dict[str, list[int]]) -> None:
+        """Check that the streams have something in common, and make poses, scans and the rig."""
+        where = f"{self.path}: {self._topic('pose')}"
+        with naming(where):
+            found["pose"], poses = self._source.poses or reader.poses(found["pose"])
+        self._stamps = {key: np.array(stamps, np.int64) for key, stamps in found.items()}
+        for key, stamps in found.items():
+            if not stamps:
+                raise InputError(f"{self.path}: {self._topic(key)} has no messages")
+        late = max(found, key=lambda key: found[key][0])
+        early = min(found, key=lambda key: found[key][-1])
+        low, high = found[late][0] / 1e9, found[early][-1] / 1e9
+        if low > high + CAMERAS_S:
+            raise InputError(
+                f"{self.path}: {self._topic(early)} ends at {high:.3f} s, before {self._topic(late)} begins at "
+                f"{low:.3f} s; want streams that overlap in time: do their clocks agree?"
+            )
+        if not (finite := np.isfinite(poses).all(axis=1)).all():
+            bad = int(finite.argmin())
+            raise InputError(f"{where}: pose {bad + 1} is {poses[bad, :3].tolist()}")
+        if self.calibration is not None:
+            at = self.calibration.origin
+            poses[:, :3] = placed(np.array([at.x, at.y, math.radians(at.yaw)]), poses[:, :3])
+        self._track = PoseTrack(self._stamps["pose"], poses)
+        self.poses = self._track.poses
+        scanners = dict.fromkeys(self._setup.clouds, SCANNER)
+        for name, scans in self._measured.items():
+            with naming(f"{self.path}: {self._topic(f'scan:{name}')}"):
+                times = found[f"scan:{name}"]
+                still = [self._without_motion(name, *one) for one in zip(scans, times, strict=True)]
+                scanners[name], self._scans[name] = common_scanner(still)
+        with naming(self.path):
+            self.rig = self._setup.rig(scanners)
+
+    def _without_motion(self, name: str, scan: Scan, stamp: int) -> Scan:
+        """Return a scan as if all its beams were measured at its stamp, the time of the first one."""
+        if not scan.delay:
+            return scan
+        beam = np.arange(len(scan.ranges))
+        late = scan.delay * (beam if scan.delay > 0.0 else beam - beam[-1])
+        vehicle = self._track.at(stamp + np.rint(np.r_[0.0, late] * 1e9).astype(np.int64))
+        mount = self._setup.lasers[name].mount
+        sensor = placed(vehicle, np.array([mount.x, mount.y, mount.yaw]))
+        moved = within(sensor[0], sensor[1:])
+        is_still = np.hypot(*moved.T[:2]).max() < _STILL[0] and np.abs(moved[:, 2]).max() < _STILL[1]
+        return scan if is_still or np.isnan(moved).any() else without_motion(scan, moved)
 
     @property
     def key(self) -> str:
@@ -160,31 +206,31 @@ class RecordedDrive:
         if self.head is not None:
             return self.head.time
         zone = self.calibration.timezone_h * 3600.0 if self.calibration else 0.0
-        return (self._stamps["pose"][0] / 1e9 + zone - RECORDED_MONDAY_S) % (7.0 * DAY_S)
+        return float((self._stamps["pose"][0] / 1e9 + zone - RECORDED_MONDAY_S) % (7.0 * DAY_S))
 
     @property
     def without_pose(self) -> int:
         """Number of pictures of the first camera that have no pose, and are left out."""
-        stamps = self._stamps[self._first]
-        return sum(self.pose_at(stamp) is None for stamp in stamps) + self._source.without_pose
+        return int(np.isnan(self._matched.poses[:, 0]).sum()) + self._source.without_pose
 
     @property
     def without_partner(self) -> int:
         """Number of pictures of the first camera with a pose but without measurements of all other sensors."""
-        stamps = [stamp for stamp in self._stamps[self._first] if self.pose_at(stamp) is not None]
-        return sum(self._partners(stamp) is None for stamp in stamps)
+        return int((~np.isnan(self._matched.poses[:, 0]) & ~self._matched.is_whole).sum())
 
     def captures(self, every: float = 0.0) -> Iterator[tuple[TimedCapture, FloatArray]]:
         """Yield captures at least `every` m apart, and the vehicle's pose of each, (3,) x, y in m and yaw in rad."""
-        plan = self._frames(every)
-        late = {key for key in self._topics if key.startswith("image:") or key[5:] in self._setup.clouds}
+        plan, partners = self._planned(every), self._matched.partners
+        late = {key for key in partners if key.startswith("image:") or key[5:] in self._setup.clouds}
+        again = {key: _shared(partners[key][plan], self._matched.off[key][plan])
+                 for key in partners if key.startswith("scan:")}  # fmt: skip
         needed: dict[tuple[str, int], list[int]] = {}
-        for k, taken in enumerate(plan):
+        for n, k in enumerate(plan):
             for key in late:
-                needed.setdefault((key, taken.partners[key]), []).append(k)
+                needed.setdefault((key, int(partners[key][k])), []).append(n)
         parts: list[dict[str, Any]] = [{} for _ in plan]
-        count = dict.fromkeys(self._topics, -1)
-        keys = {self._topics[key]: key for key in late}
+        count = dict.fromkeys(late, -1)
+        keys = {self._setup.topics[key]: key for key in late}
         done = 0
         with self._source.open() as (_, messages):
             for topic, _, message in messages(set(keys)):
@@ -193,192 +239,82 @@ class RecordedDrive:
                 if takers := needed.get((key, count[key]), ()):
                     read = self._decoded if key.startswith("image:") else self._cloud
                     part = read(key, message, count[key])
-                    for k in takers:
-                        parts[k][key] = part
+                    for n in takers:
+                        parts[n][key] = part
                 while done < len(plan) and len(parts[done]) == len(late):
-                    yield self._capture(plan[done], parts[done])
+                    shared = frozenset(key[5:] for key, is_shared in again.items() if is_shared[done])
+                    yield self._capture(plan[done], shared, parts[done])
                     parts[done] = {}
                     done += 1
 
-    def _add_stamp(self, key: str, stamp: int) -> None:
-        before = self._stamps[key]
-        if before and stamp <= before[-1]:
-            raise InputError(
-                f"{self.path}: {self._topics[key]}: time goes from {before[-1] / 1e9:.6f} to "
-                f"{stamp / 1e9:.6f} s at message {len(before) + 1}, want it to rise"
-            )
-        before.append(stamp)
-
-    def _finish(self, reader: PoseReader) -> None:
-        """Check that the streams have something in common, and make poses, scans and the rig."""
-        with naming(f"{self.path}: {self._topics['pose']}"):
-            self._stamps["pose"], poses = reader.poses(self._stamps["pose"])
-        spans = {}
-        for key, stamps in self._stamps.items():
-            topic = self._topics[key]
-            if not stamps:
-                raise InputError(f"{self.path}: {topic} has no messages")
-            spans[topic] = (stamps[0] / 1e9, stamps[-1] / 1e9)
-        low, high = max(s[0] for s in spans.values()), min(s[1] for s in spans.values())
-        if low > high + CAMERAS_S:
-            late = next(topic for topic, span in spans.items() if span[0] == low)
-            early = next(topic for topic, span in spans.items() if span[1] == high)
-            raise InputError(
-                f"{self.path}: {early} ends at {high:.3f} s, before {late} begins at {low:.3f} s; want streams that "
-                "overlap in time: do their clocks agree?"
-            )
-        if not np.isfinite(poses).all():
-            bad = int(np.flatnonzero(~np.isfinite(poses).all(axis=1))[0])
-            raise InputError(
-                f"{self.path}: {self._topics['pose']}: pose {bad + 1} is {poses[bad, :3].tolist()}"
-            )
-        at = self.calibration.origin if self.calibration else None
-        if at is not None and (at.x, at.y, at.yaw) != (0.0, 0.0, 0.0):
-            turn = math.radians(at.yaw)
-            c, s = math.cos(turn), math.sin(turn)
-            x, y, yaw = poses.T[:3]
-            poses = np.column_stack([at.x + c * x - s * y, at.y + s * x + c * y, yaw + turn, poses[:, 3:]])
-        self._track = PoseTrack(self._stamps["pose"], poses)
-        self.poses = self._track.poses
-        start = self._stamps["pose"][0]
-        self.pose_s = (np.array(self._stamps["pose"], np.int64) - start) / 1e9
-        self._scanners = dict.fromkeys(self._setup.clouds, SCANNER)
-        for name, scans in self._measured.items():
-            with naming(f"{self.path}: {self._topics[f'scan:{name}']}"):
-                stamps = self._stamps[f"scan:{name}"]
-                still = [self._without_motion(name, one, at) for one, at in zip(scans, stamps, strict=True)]
-                self._scanners[name], self._scans[name] = common_scanner(still)
-        if self.head is not None and self.calibration is None:
-            self._be_a_survey(self.head)
-        else:
-            self.rig = self._setup.rig(self._scanners)
-
-    def _be_a_survey(self, head: Head) -> None:
-        rig = self.rig = SensorRig.named(head.rig)
-        cameras = [(f"image:{name}:mono", camera) for name, camera, _ in rig.cameras]
-        for name, pair, _ in rig.stereo_cameras:
-            cameras += [(f"image:{name}:{side}", pair.camera) for side in ("left", "right")]
-        wanted = {f"scan:{name}" for name, _, _ in rig.lasers} | {key for key, _ in cameras}
-        if missing := sorted(wanted - self._topics.keys()):
-            raise InputError(f"{self.path}: has no {missing[0].replace(':', ' ')}, which its rig has")
-        for name, laser, _ in rig.lasers:
-            if self._scanners[name].n_beams != laser.n_beams:
-                raise InputError(
-                    f"{self.path}: {name} has {self._scanners[name].n_beams} beams, want {laser.n_beams}"
-                )
-        self._setup.pictures = {key: Picture((c.width, c.height), c.matrix, c) for key, c in cameras}
-
-    def _without_motion(self, name: str, scan: Scan, stamp: int) -> Scan:
-        """Return a scan as if all its beams were measured at its stamp, the time of the first one."""
-        placed = self._setup.lasers.get(name)
-        if not scan.delay or placed is None or self.pose_at(stamp) is None:
-            return scan
-        beam = np.arange(len(scan.ranges))
-        late = scan.delay * (beam if scan.delay > 0.0 else beam - beam[-1])
-        vehicle = self._track.during(np.concatenate([[0.0], late * 1e9]) + float(stamp))
-        m = placed.mount
-        c, s = np.cos(vehicle[:, 2]), np.sin(vehicle[:, 2])
-        sensor = vehicle + np.column_stack([c * m.x - s * m.y, s * m.x + c * m.y, np.full(len(c), m.yaw)])
-        moved = within(sensor[0], sensor[1:])
-        if np.hypot(*moved.T[:2]).max() < _STILL[0] and np.abs(moved[:, 2]).max() < _STILL[1]:
-            return scan
-        return without_motion(scan, moved)
-
-    def _partners(self, stamp: int) -> dict[str, int] | None:
-        """Return the index of each sensor's message that joins a picture of the first camera; None if one lacks."""
-        found: dict[str, int] = {}
-        for key, stamps in self._arrays.items():
-            beside, most = stamp, CAMERAS_S
-            if key.startswith("scan:"):
-                most = LASER_S
-            elif key.endswith(":right"):
-                left = f"{key.rpartition(':')[0]}:left"
-                beside, most = int(self._arrays[left][found[left]]), PAIR_S
-            found[key] = _nearest(stamps, beside)
-            off = abs(int(stamps[found[key]]) - beside)
-            if off > most * 1e9 or (off > CAMERAS_S * 1e9 and self.pose_at(int(stamps[found[key]])) is None):
-                return None
+    @cached_property
+    def _matched(self) -> _Matched:
+        """What joins the pictures of the first camera."""
+        first = self._stamps[next(key for key in self._stamps if key.startswith("image:"))]
+        found = _Matched(first, self._track.at(first), np.ones(len(first), np.bool_), {}, {})
+        for key in sorted(
+            self._stamps.keys() - {"pose", "imu"}
+        ):  # the left camera of a pair before the right one
+            beside, most = first, LASER_S if key.startswith("scan:") else CAMERAS_S
+            if key.startswith("image:") and key.endswith(":right"):
+                left = f"{key[:-5]}left"
+                beside, most = self._stamps[left][found.partners[left]], PAIR_S
+            index = found.partners[key] = _nearest(self._stamps[key], beside)
+            at = self._stamps[key][index]
+            off = found.off[key] = np.abs(at - beside)
+            found.is_whole[off > most * 1e9] = False
+            found.is_whole[(off > CAMERAS_S * 1e9) & np.isnan(self._track.at(at)[:, 0])] = False
         return found
 
-    @property
-    def _arrays(self) -> dict[str, IntArray]:
-        """Stamps of the sensors; the left camera of a pair is before the right one."""
-        if not hasattr(self, "_as_arrays"):
-            keys = sorted(key for key in self._stamps if key not in ("pose", "imu"))
-            self._as_arrays = {key: np.array(self._stamps[key], np.int64) for key in keys}
-        return self._as_arrays
-
-    def _frames(self, every: float) -> list[_Taken]:
-        plan: list[_Taken] = []
-        for stamp in self._stamps[self._first]:
-            pose = self.pose_at(stamp)
-            partners = None if pose is None else self._partners(stamp)
-            if pose is None or partners is None:
-                continue
-            if plan and every > 0.0 and float(np.hypot(*(pose - plan[-1].pose)[:2])) < every:
-                continue
-            plan.append(_Taken(stamp, partners, pose))
+    def _planned(self, every: float) -> list[int]:
+        """Return the numbers of the first camera's pictures that become captures."""
+        plan: list[int] = []
+        poses = self._matched.poses
+        for k in np.flatnonzero(self._matched.is_whole & ~np.isnan(poses[:, 0])).tolist():
+            if not plan or float(np.hypot(*(poses[k] - poses[plan[-1]])[:2])) >= every:
+                plan.append(k)
         if not plan:
-            self._refuse_pairs()
-            raise InputError(
-                f"{self.path}: no picture of {self._topics[self._first]} has a pose and measurements of all "
-                f"other sensors: cameras within {CAMERAS_S} s, lasers within {LASER_S} s"
-            )
-        nearest: dict[tuple[str, int], tuple[int, int]] = {}
-        for k, taken in enumerate(plan):
-            for key, index in taken.partners.items():
-                off = abs(int(self._arrays[key][index]) - taken.stamp)
-                nearest[key, index] = min(nearest.get((key, index), (off, k)), (off, k))
-        return [
-            taken._replace(
-                again=frozenset(key for key, i in taken.partners.items() if nearest[key, i][1] != k)
-            )
-            for k, taken in enumerate(plan)
-        ]
-
-    def _refuse_pairs(self) -> None:
-        for key, stamps in self._arrays.items():
-            if key.endswith(":right"):
-                left = self._arrays[f"{key.rpartition(':')[0]}:left"]
-                least = (
-                    min(abs(int(stamps[_nearest(stamps, int(stamp))]) - int(stamp)) for stamp in left) / 1e9
-                )
-                if least > PAIR_S:
+            for key, off in self._matched.off.items():
+                if key.startswith("image:") and key.endswith(":right") and off.min() > PAIR_S * 1e9:
                     raise InputError(
-                        f"{self.path}: no pictures of {self._topics[key]} are of the same moment as those of "
-                        f"{self._topics[f'{key[:-5]}left']}: {least:.4f} s apart at least, want at most {PAIR_S} s"
+                        f"{self.path}: no pictures of {self._topic(key)} are of the same moment as those of "
+                        f"{self._topic(f'{key[:-5]}left')}: {off.min() / 1e9:.4f} s apart at least, want at most "
+                        f"{PAIR_S} s"
                     )
+            raise InputError(
+                f"{self.path}: no picture has a pose and measurements of all other sensors: cameras within "
+                f"{CAMERAS_S} s, lasers within {LASER_S} s"
+            )
+        return plan
 
-    @property
-    def _first(self) -> str:
-        return next(key for key in self._stamps if key.startswith("image:"))
-
-    def pose_at(self, stamp: int) -> FloatArray | None:
-        """Return the interpolated pose, (3,), at a time, ns of Unix time; None where there is none."""
-        return self._track.at(stamp)
-
-    def _capture(self, taken: _Taken, parts: dict[str, Any]) -> tuple[TimedCapture, FloatArray]:
-        stamp, partners, pose, again = taken
+    def _capture(
+        self, k: int, again: frozenset[str], parts: dict[str, Any]
+    ) -> tuple[TimedCapture, FloatArray]:
+        stamp, pose, tilt = (
+            int(self._matched.stamps[k]),
+            self._matched.poses[k],
+            self._track.tilt(self._matched.stamps[k]),
+        )
         frames = {
             key: Frame(image, _NO_DEPTH, _NO_DEPTH, _NO_IDS)
             for key, image in parts.items()
             if key.startswith("image:")
         }
         scans, tops, moved = {}, {}, {}
-        tilt = self._track.tilt(stamp)
         for name, _, _ in self.rig.lasers:
             key = f"scan:{name}"
-            then = int(self._arrays[key][partners[key]])
-            if then != stamp and (where := self._track.moved(then, pose)) is not None:
+            index = self._matched.partners[key][k]
+            then = self._stamps[key][index]
+            where = within(pose, self._track.at(then[None])[0])
+            if then != stamp and not np.isnan(where).any():
                 moved[name] = where
             if name not in self._setup.clouds:
-                scans[name] = self._scans[name][partners[key]]
+                scans[name] = self._scans[name][index]
                 continue
             cloud: CloudScan = parts[key]
             scans[name], tops[name] = cloud.ranges, cloud.tops
             # What the vehicle turned between the two moments comes from the poses.
-            now, before = self._track.tilt(stamp), self._track.tilt(then)
-            tilt = cloud.tilt[0] + now[0] - before[0], cloud.tilt[1] + now[1] - before[1]
+            tilt = cloud.tilt + self._track.tilt(stamp) - self._track.tilt(then)
         capture = Capture(
             pose,
             {name: frames[f"image:{name}:mono"] for name, _, _ in self.rig.cameras},
@@ -386,20 +322,20 @@ class RecordedDrive:
                 name: StereoFrame(frames[f"image:{name}:left"], frames[f"image:{name}:right"])
                 for name, _, _ in self.rig.stereo_cameras
             },
-            scans, moved, frozenset(key[5:] for key in again if key.startswith("scan:")), tops, tilt,
+            scans, moved, again, tops, (float(tilt[0]), float(tilt[1])),
         )  # fmt: skip
-        return TimedCapture(self.start + (stamp - self._stamps["pose"][0]) / 1e9, capture), pose
+        return TimedCapture(self.start + (stamp - int(self._stamps["pose"][0])) / 1e9, capture), pose
 
     def _cloud(self, key: str, message: Any, index: int) -> CloudScan:
         name = key[5:]
         placed = self._setup.lasers[name]
-        with naming(f"{self.path}: {self._topics[key]}: cloud {index + 1}"):
+        with naming(f"{self.path}: {self._topic(key)}: cloud {index + 1}"):
             points = placed.in_vehicle(points_of(message))
             road = fit_road(points) or Road(0.0, 0.0, -placed.mount.z)
             return scan_of_cloud(points, road)
 
     def _decoded(self, key: str, message: Any, index: int) -> NDArray[np.uint8]:
-        where = f"{self.path}: {self._topics[key]}: image {index + 1}"
+        where = f"{self.path}: {self._topic(key)}: image {index + 1}"
         image = picture_in(message, where)
         image = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
         picture = self._setup.pictures[key]
@@ -412,6 +348,10 @@ class RecordedDrive:
 
     def require_near(self, lot: ParkingLot) -> None:
         """Check that the poses can be in the frame of a lot: that some are at most `FAR_M` away from it."""
+        if self.frame is not None and not self._is_placed:
+            raise InputError(
+                f"{self.path}: its poses are in degrees, and the lot in metres; want --origin LAT,LON of its x = y = 0"
+            )
         low, high = lot.slot_xy.min(axis=0), lot.slot_xy.max(axis=0)
         xy = self.poses[:, :2]
         away = float(np.hypot(*(np.clip(xy, low, high) - xy).T).min())
@@ -421,19 +361,6 @@ class RecordedDrive:
                 f"{self.path}: its poses, such as {x:.0f}, {y:.0f}, are {away:,.0f} m away from the lot; want them "
                 "in its frame: `origin` in the calibration, or --origin LAT,LON of its x = y = 0 for poses in degrees"
             )
-
-
-def _setup_of_survey(types: dict[str, str]) -> DriveSetup:
-    """Return the topics of a recording of `parkenv survey --record`, whose rig its head names."""
-    topics = {"pose": POSE}
-    for topic, kind in types.items():
-        name, _, what = topic[1:].partition("/")
-        if kind == SCAN:
-            topics[f"scan:{name}"] = topic
-        elif kind == COMPRESSED_IMAGE:
-            side = what.partition("/")[0] if what.startswith(("left", "right")) else "mono"
-            topics[f"image:{name}:{side}"] = topic
-    return DriveSetup(topics)
 
 
 def map_drive(
@@ -490,32 +417,15 @@ def mapped_drive(
 
 
 def _rows_of(parked: ParkedCars, lot: ParkingLot, slots: SlotFilter) -> Iterator[dict[str, Any]]:
-    of_slots = slots.slots_of(parked.located).tolist()
-    columns = (
-        parked.time,
-        parked.xy,
-        parked.yaw,
-        parked.size,
-        parked.std,
-        parked.probability,
+    numbers = (
+        parked.time, parked.xy, parked.yaw, parked.size, parked.std, parked.probability, parked.sightings,
         parked.distance,
-    )
-    names = (
-        "time_s",
-        "x_m",
-        "y_m",
-        "yaw_rad",
-        "length_m",
-        "width_m",
-        "position_std_m",
-        "probability",
-        "distance_m",
-    )
-    for row, n, slot in zip(
-        np.column_stack(columns).tolist(), parked.sightings.tolist(), of_slots, strict=True
-    ):
-        place: dict[str, Any] = {name: round(value, 3) for name, value in zip(names, row, strict=True)}
-        yield place | {"sightings": n, "slot": lot.slot_ids[slot] if slot >= 0 else ""}
+    )  # fmt: skip
+    of_slots = slots.slots_of(parked.located).tolist()
+    for row, slot in zip(np.column_stack(numbers).tolist(), of_slots, strict=True):
+        place = [*(round(value, 3) for value in row), lot.slot_ids[slot] if slot >= 0 else ""]
+        found: dict[str, Any] = dict(zip(CAR_COLUMNS, place, strict=True))
+        yield found | {"sightings": int(found["sightings"])}
 
 
 def _sightings(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[str, Any]]:
@@ -531,8 +441,13 @@ def _sightings(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[
         yield {name: round(value, 3) if isinstance(value, float) else value for name, value in place.items()}
 
 
-def _nearest(stamps: IntArray, stamp: int) -> int:
-    after = int(np.searchsorted(stamps, stamp))
-    if after == len(stamps) or (after and stamp - stamps[after - 1] <= stamps[after] - stamp):
-        return after - 1
-    return after
+def _nearest(stamps: IntArray, at: IntArray) -> IntArray:
+    after = np.searchsorted(stamps, at).clip(1, None).clip(None, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(at - stamps[before] <= stamps[after] - at, before, after)
+
+
+def _shared(messages: IntArray, off: IntArray) -> BoolArray:
+    """Return which captures have a message that another one, nearer in time, has, too."""
+    order = np.lexsort([off, messages])
+    return ~np.isin(np.arange(len(order)), order[np.unique(messages[order], return_index=True)[1]])

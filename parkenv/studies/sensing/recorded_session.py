@@ -14,11 +14,11 @@ from parkenv.lots.formats.geojson import read_contents
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import lot_format
 from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.drive_formats import source_of
+from parkenv.mapping.drive_folders import source_of
 from parkenv.mapping.inference import predict
 from parkenv.mapping.map_files import week_time, write_grid, write_slots
 from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.recorded_drive import MappedDrive, RecordedDrive, map_drive
+from parkenv.mapping.recorded_drive import CAR_COLUMNS, MappedDrive, RecordedDrive, map_drive
 from parkenv.mapping.store import MapStore
 from parkenv.perception.detector_registry import make_detector
 from parkenv.scenarios.build import make_scenario
@@ -28,10 +28,6 @@ from parkenv.studies.sensing.sessions import MAP_FILE
 from parkenv.studies.study import Progress, counted
 from parkenv.world.scenario import Scenario
 
-CAR_COLUMNS = (
-    "time_s", "x_m", "y_m", "yaw_rad", "length_m", "width_m", "position_std_m", "probability", "sightings",
-    "distance_m", "slot",
-)  # fmt: skip
 SIGHTING_COLUMNS = (
     "time_s", "camera", "x_m", "y_m", "yaw_rad", "probability", "distance_m", "distance_std_m",
     "position_std_m", "slot",
@@ -86,14 +82,12 @@ def read_drive(
     calibration: DriveCalibration | None,
     photos: PhotoOptions | None,
     frame: LocalFrame | None,
-    *,
-    own_frame: bool = False,
 ) -> RecordedDrive:
-    """Read a recording, or photographs with poses; the frame says where poses in degrees are."""
+    """Read a recording, or photographs with poses; the frame says where poses in degrees are, None: around them."""
     photos = photos or PhotoOptions()
     if photos.origin is not None:
         frame = LocalFrame(photos.origin[1], photos.origin[0])
-    source = source_of(recording, calibration, photos, frame, own_frame)
+    source = source_of(recording, calibration, photos, frame)
     return RecordedDrive(recording, calibration, source, frame)
 
 

@@ -24,7 +24,13 @@ from parkenv.mapping.car_tracks import CarTracks, ParkedCars
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.map_files import write_grid, write_slots
 from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.recorded_drive import MappedDrive, RecordedDrive, mapped_drive, require_ranges
+from parkenv.mapping.recorded_drive import (
+    CAR_COLUMNS,
+    MappedDrive,
+    RecordedDrive,
+    mapped_drive,
+    require_ranges,
+)
 from parkenv.mapping.scan_matching import make_locate
 from parkenv.mapping.store import MapStore, Session
 from parkenv.mapping.street_lanes import driven_lanes, mapped_lanes, street_lot
@@ -35,7 +41,7 @@ from parkenv.perception.detector_registry import make_detector
 from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
 from parkenv.perception.slot_filter import SlotFilter
 from parkenv.studies.results import Row
-from parkenv.studies.sensing.recorded_session import CAR_COLUMNS, SIGHTING_COLUMNS, drive_row, read_drive
+from parkenv.studies.sensing.recorded_session import SIGHTING_COLUMNS, drive_row, read_drive
 from parkenv.studies.sensing.sessions import MAP_FILE
 from parkenv.studies.study import Progress, counted
 from parkenv.world.lot import Lane, ParkingLot
@@ -92,7 +98,7 @@ def discover_recordings(
     frame = earlier.frame if earlier else None
     drives: list[_Located] = []
     for recording in recordings:
-        drive = read_drive(recording, calibration, photos, frame, own_frame=True)
+        drive = read_drive(recording, calibration, photos, frame)
         frame = frame or drive.frame
         known = {one.drive.key for one in drives} | {one.key for one in (earlier.sessions if earlier else ())}
         require(drive.key not in known, f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
