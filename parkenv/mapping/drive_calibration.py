@@ -89,12 +89,14 @@ class RightCamera(Lens):
 
     @property
     def matrix(self) -> FloatArray:
-        if len(self.rotation) == 3:
-            return np.asarray(Rotation.from_rotvec(self.rotation).as_matrix())
-        r = np.resize(self.rotation, (3, 3))
-        if len(self.rotation) != 9 or np.abs(r @ r.T - np.eye(3)).max() > 0.01:
-            raise InputError(f"right_camera.rotation is {self.rotation}, want a rotation of 3 or 9 numbers")
-        return np.asarray(r, dtype=np.float64)
+        try:
+            is_vector, numbers = len(self.rotation) == 3, np.array(self.rotation)
+            turn = Rotation.from_rotvec(numbers) if is_vector else Rotation.from_matrix(numbers.reshape(3, 3))
+        except ValueError as error:
+            raise InputError(
+                f"right_camera.rotation is {self.rotation}, want a rotation of 3 or 9 numbers"
+            ) from error
+        return np.asarray(turn.as_matrix())
 
 
 class StereoSpec(SizedLens):

@@ -206,20 +206,21 @@ class _Recording:
     def choose(self, given: DriveCalibration) -> DriveCalibration:
         """Return the calibration with the topics that it leaves out, chosen by type where there is one of a kind."""
         lasers, cameras, pairs = given.lasers, given.cameras, given.stereo_cameras
-        if not (cameras or pairs or lasers) and (measured := self.of(CLOUD) or self.of(SCAN)):
+        if not (cameras or pairs or lasers) and self.of(CLOUD, SCAN):
+            lasers = (LaserSpec(name="laser"),)
             self._unplaced.add("laser")
-            lasers = (LaserSpec(name="laser", topic=self.only("laser", measured)),)
         if not (cameras or pairs):
             if given._file and not self.infos:
                 raise InputError(f"{given._file}: has no camera, want cameras or stereo_cameras")
             self._unplaced.add("camera")
-            if len(found := self._pairs()) == 1 and not lasers:
+            if len(self._pairs()) == 1 and not lasers:
                 pairs = (StereoSpec(name="camera"),)
             else:
-                topics = [left for left, _ in found] if len(found) == 1 else self._pictures()
-                cameras = (CameraSpec(name="camera", topic=self.only("camera", topics)),)
-        lasers = tuple(self._with_topic(one, "laser", self.of(SCAN, CLOUD)) for one in lasers)
-        cameras = tuple(self._with_topic(one, "camera", self._pictures()) for one in cameras)
+                cameras = (CameraSpec(name="camera"),)
+        left = [left for left, _ in self._pairs()]
+        topics = left if len(left) == 1 else self._pictures()
+        lasers = tuple(self._with_topic(one, "laser", self.of(CLOUD) or self.of(SCAN)) for one in lasers)
+        cameras = tuple(self._with_topic(one, "camera", topics) for one in cameras)
         pairs = tuple(one if one.left and one.right else self._with_pair(one) for one in pairs)
         chosen = {"cameras": cameras, "stereo_cameras": pairs, "lasers": lasers}
         return given.model_copy(update=chosen)

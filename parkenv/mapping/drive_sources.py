@@ -105,22 +105,24 @@ class CloudFile:
 
     @property
     def xyz(self) -> NDArray[np.float32]:
+        file = self.path
         try:
-            if self.path.suffix == ".npz":
-                arrays = read_arrays(self.path)
-                scale = 0.01 if "xyz_cm" in arrays else 1.0
-                points = np.asarray(
-                    arrays["xyz_cm" if "xyz_cm" in arrays else "xyz"] * np.float32(scale), np.float32
-                )
-            elif self.path.suffix == ".bin":
-                points = np.frombuffer(read_bytes(self.path), "<f4").reshape(-1, 4)
+            if file.suffix == ".npz":
+                arrays = read_arrays(file)
+                name, scale = ("xyz_cm", 0.01) if "xyz_cm" in arrays else ("xyz", 1.0)
+                points = np.asarray(arrays[name] * np.float32(scale), np.float32)
             else:
-                points = np.array(read_text(self.path).split(), dtype=np.float32).reshape(-1, 4)
+                numbers = (
+                    np.frombuffer(read_bytes(file), "<f4")
+                    if file.suffix == ".bin"
+                    else read_text(file).split()
+                )
+                points = np.array(numbers, np.float32).reshape(-1, 4)
             if points.ndim != 2 or points.shape[1] not in (3, 4):
                 raise ValueError(f"it has the shape {points.shape}")
         except (KeyError, ValueError, TypeError) as error:
             if isinstance(error, InputError):
                 raise
             wanted = "xyz or xyz_cm, (n, 3), in .npz, or four float32 a point in .bin"
-            raise InputError(f"{self.path}: is no point cloud ({error}), want {wanted}") from error
+            raise InputError(f"{file}: is no point cloud ({error}), want {wanted}") from error
         return points[:, :3]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -52,24 +53,19 @@ def _raw(folder: Path, frame: LocalFrame | None) -> Source:
     turned = _matrix(_part(to_cam, "R_rect_00", 9, folder))
     velo_in_cam = turned @ _rigid(calibration("calib_velo_to_cam.txt"), folder)
     imu_in_velo = _rigid(calibration("calib_imu_to_velo.txt"), folder)
-    tree, streams, infos = FrameTree(), dict[str, Stream](), dict[str, Info]()
-    tree.add(_BASE, _IMU, _raised(IMU_HEIGHT_M))
-    tree.add(_IMU, "velodyne_points", _inverse(imu_in_velo))
+    found = _Sensors()
+    found.tree.add(_BASE, _IMU, _raised(IMU_HEIGHT_M))
+    found.tree.add(_IMU, "velodyne_points", _inverse(imu_in_velo))
     for k in range(4):
         # The cameras are triggered together; the times of the second of each pair are those of its computer.
-        name, clock = f"image_0{k}", f"image_0{k // 2 * 2}"
+        name, clock = f"image_0{k}", folder / f"image_0{k // 2 * 2}"
         if (folder / name / "data").is_dir():
-            streams[name] = stream_of(folder / name / "data", _times(folder / clock))
             parts = {part: _part(to_cam, f"{part}_0{k}", n, folder) for part, n in _CAMERA_PARTS}
-            at = _shift_of(parts["P_rect"]) @ velo_in_cam
-            infos[name] = _lens(streams[name], parts)
-            if infos[name].distortion:
-                at = _inverse(_matrix(parts["R_rect"])) @ at
-            tree.add("velodyne_points", name, _inverse(at))
-    if (folder / "velodyne_points/data").is_dir():
-        streams["velodyne_points"] = stream_of(
-            folder / "velodyne_points/data", _times(folder / "velodyne_points")
-        )
+            found.add_camera(
+                name, stream_of(folder / name / "data", _times(clock)), parts, "velodyne_points", velo_in_cam
+            )
+    if (place := folder / "velodyne_points").is_dir():
+        found.streams[place.name] = stream_of(place / "data", _times(place))
     times = _times(folder / "oxts")
     files = {stamp: file for file in files_in(folder / "oxts/data", (".txt",))
              if (stamp := times.get(str(int(file.stem)) if file.stem.isdecimal() else "")) is not None}  # fmt: skip
@@ -79,10 +75,7 @@ def _raw(folder: Path, frame: LocalFrame | None) -> Source:
         frame = frame or LocalFrame.around(poses[:, :2])
         poses[:, :2] = frame.to_xy(poses[:, :2])
     std = float(np.sqrt(np.median(rows[:, _POS_ACCURACY] ** 2))) if len(rows) else 0.0
-    return Source(
-        partial(opened, streams), poses=(sorted(files), poses), frame=frame, errors=RangingErrors.of_poses(std, 0.0),
-        tree=tree, infos=infos,
-    )  # fmt: skip
+    return found.source((sorted(files), poses), frame=frame, errors=RangingErrors.of_poses(std, 0.0))
 
 
 def _odometry(folder: Path) -> Source:
@@ -98,37 +91,49 @@ def _odometry(folder: Path) -> Source:
     turns = Rotation.from_matrix(rows[:, :, :3] @ OPTICAL.T)
     poses = np.column_stack([rows[:, :2, 3], angles_of(turns)])
     base_in_camera = _inverse(_raised(CAMERA_HEIGHT_M) @ _matrix(OPTICAL))
-    tree, streams, infos = FrameTree(), dict[str, Stream](), dict[str, Info]()
+    found = _Sensors()
     for k in range(4):
         if (place := folder / f"image_{k}").is_dir():
-            projection = _part(numbers, f"P{k}", 12, folder)
-            streams[place.name] = stream_of(place, stamps)
-            infos[place.name] = _lens(streams[place.name], {"P_rect": projection})
-            tree.add(_BASE, place.name, _inverse(_shift_of(projection) @ base_in_camera))
+            parts = {"P_rect": _part(numbers, f"P{k}", 12, folder)}
+            found.add_camera(place.name, stream_of(place, stamps), parts, _BASE, base_in_camera)
     if (place := folder / "velodyne").is_dir():
-        streams[place.name] = stream_of(place, stamps)
+        found.streams[place.name] = stream_of(place, stamps)
         in_camera = np.vstack([_part(numbers, "Tr", 12, folder).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-        tree.add(_BASE, place.name, _inverse(base_in_camera) @ in_camera)
-    return Source(partial(opened, streams), poses=(times[: len(poses)], poses), tree=tree, infos=infos)
+        found.tree.add(_BASE, place.name, _inverse(base_in_camera) @ in_camera)
+    return found.source((times[: len(poses)], poses))
 
 
-def _lens(pictures: Stream, parts: dict[str, FloatArray]) -> Info:
-    """Return the lens of a camera: of rectified pictures, if their size is that of rectified ones."""
-    p = parts["P_rect"].reshape(3, 4)
-    _, first = next(iter(pictures.messages))
-    height, width = read_image(first().path).shape[:2]
-    size = width, height
-    recorded, rectified = (
-        (int(parts[n][0]), int(parts[n][1])) if n in parts else size for n in ("S", "S_rect")
-    )
-    if size == rectified:
-        return Info(size, p[:, :3], (), False, np.eye(3), p, rectified)
-    if size != recorded:
-        raise InputError(
-            f"{first().path}: is {width}×{height} px, want {rectified} or, not rectified, {recorded}"
-        )
-    k, r = (parts[n].reshape(3, 3) for n in ("K", "R_rect"))
-    return Info(size, k, tuple(parts["D"].tolist()), False, r, p, rectified)
+class _Sensors:
+    """The sensors of a folder: their messages, lenses and places."""
+
+    def __init__(self) -> None:
+        self.tree, self.streams = FrameTree(), dict[str, Stream]()
+        self._infos: dict[str, Info] = {}
+
+    def source(self, poses: tuple[list[int], FloatArray], **known: Any) -> Source:
+        opens = partial(opened, self.streams)
+        return Source(opens, poses=poses, tree=self.tree, infos=self._infos, **known)
+
+    def add_camera(
+        self, name: str, pictures: Stream, parts: dict[str, FloatArray], frame: str, in_camera: FloatArray
+    ) -> None:
+        """Add a camera, of rectified pictures if their size is that of rectified ones; `in_camera`: a frame's pose."""
+        p = parts["P_rect"].reshape(3, 4)
+        file = next(iter(pictures.messages))[1]().path
+        height, width = read_image(file).shape[:2]
+        sizes = {n: (int(parts[n][0]), int(parts[n][1])) if n in parts else (width, height)
+                 for n in ("S", "S_rect")}  # fmt: skip
+        at = _matrix(np.eye(3), np.asarray(np.linalg.solve(p[:, :3], p[:, 3]), dtype=np.float64)) @ in_camera
+        k, d, r = p[:, :3], np.zeros(0), np.eye(3)
+        if (width, height) != sizes["S_rect"]:
+            k, d, r = parts["K"].reshape(3, 3), parts["D"], parts["R_rect"].reshape(3, 3)
+            at = _inverse(_matrix(r)) @ at
+        if (width, height) not in sizes.values():
+            wanted = f"{sizes['S_rect']} or, not rectified, {sizes['S']}"
+            raise InputError(f"{file}: is {width}×{height} px, want {wanted}")
+        self.streams[name] = pictures
+        self._infos[name] = Info((width, height), k, tuple(d.tolist()), False, r, p, sizes["S_rect"])
+        self.tree.add(frame, name, _inverse(at))
 
 
 def _times(folder: Path) -> dict[str, int]:
@@ -190,9 +195,3 @@ def _raised(height: float) -> FloatArray:
 
 def _inverse(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-
-
-def _shift_of(projection: FloatArray) -> FloatArray:
-    """Return what takes points from the first camera's frame to that of a projection, (4, 4)."""
-    p = projection.reshape(3, 4)
-    return _matrix(np.eye(3), np.asarray(np.linalg.solve(p[:, :3], p[:, 3]), dtype=np.float64))

@@ -40,11 +40,8 @@ class Picture:
 
     @property
     def coefficients(self) -> FloatArray:
-        """The distortion, with zeros to one of the lengths that OpenCV takes."""
-        n = len(self.distortion)
-        return np.pad(
-            np.array(self.distortion, np.float64), (0, next(m for m in (5, 8, 12, 14) if m >= n) - n)
-        )
+        """The distortion, with zeros to the most numbers that OpenCV takes."""
+        return np.pad(np.array(self.distortion, np.float64), (0, 14 - len(self.distortion)))
 
     @cached_property
     def _maps(self) -> tuple[NDArray[Any], NDArray[Any]] | None:

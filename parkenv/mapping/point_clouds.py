@@ -6,6 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from parkenv.compiled.arrays import BoolArray, Float32Array, FloatArray
 from parkenv.errors import InputError
@@ -57,25 +58,20 @@ def points_of(message: Any) -> Float32Array:
         fields = {field.name: field for field in message.fields}
         size, height, width = int(message.point_step), int(message.height), int(message.width)
         order = ">" if message.is_bigendian else "<"
-        formats = [_FLOATS.get(int(fields[n].datatype)) if n in fields else None for n in "xyz"]
-        row, data = int(message.row_step) or size * width, np.frombuffer(bytes(message.data), np.uint8)
-        if None in formats or any(
-            int(fields[n].offset) + int(str(f)[1]) > size for n, f in zip("xyz", formats, strict=True)
-        ):
+        try:
+            kind = np.dtype({
+                "names": list("xyz"), "formats": [order + _FLOATS[int(fields[n].datatype)] for n in "xyz"],
+                "offsets": [int(fields[n].offset) for n in "xyz"], "itemsize": size,
+            })  # fmt: skip
+        except (KeyError, ValueError) as error:
+            names = ", ".join(fields) or "none"
             raise InputError(
-                f"a cloud has the fields {', '.join(fields) or 'none'}, want x, y and z of float32 or float64"
-            )
+                f"a cloud has the fields {names}, want x, y and z of float32 or float64"
+            ) from error
+        data, row = bytes(message.data), int(message.row_step) or size * width
         if row < size * width or height * row > len(data):
             raise InputError(f"a cloud has {len(data):,} bytes for {width}×{height} points of {size} bytes")
-        kind = np.dtype({
-            "names": list("xyz"), "formats": [f"{order}{f}" for f in formats],
-            "offsets": [int(fields[n].offset) for n in "xyz"], "itemsize": size,
-        })  # fmt: skip
-        stored = (
-            np.ascontiguousarray(data[: height * row].reshape(height, row)[:, : width * size])
-            .view(kind)
-            .ravel()
-        )
+        stored = np.ndarray((height, width), kind, data, strides=(row, size)).ravel()
         points = np.column_stack([stored[n] for n in "xyz"]).astype(np.float32)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
@@ -125,7 +121,7 @@ def fit_road(points: FloatArray | Float32Array) -> Road | None:
 def scan_of_cloud(points: FloatArray | Float32Array, road: Road) -> CloudScan:
     """Return in each direction around the vertical axis the nearest return in a band above the road, and its top."""
     normal = np.array([-road.a, -road.b, 1.0]) / math.sqrt(road.a**2 + road.b**2 + 1.0)
-    to_level = _turn_up(normal).astype(np.float32)
+    to_level = Rotation.align_vectors([0.0, 0.0, 1.0], normal)[0].as_matrix().astype(np.float32)
     x, y, up = (points.astype(np.float32) @ to_level.T).T
     height = up - np.float32(road.c * normal[2])
     distance = np.hypot(x, y)
@@ -149,13 +145,3 @@ def scan_of_cloud(points: FloatArray | Float32Array, road: Road) -> CloudScan:
     # Near the sensor its lowest layer is above the band: what stands there may be met only higher up.
     ranges[over + _OVER_M < ranges] = np.nan
     return CloudScan(ranges, tops, road.tilt)
-
-
-def _turn_up(normal: FloatArray) -> FloatArray:
-    """Return the least rotation, (3, 3), that turns a unit vector upwards."""
-    a, b, c = normal
-    return np.array([
-        [1.0 - a * a / (1.0 + c), -a * b / (1.0 + c), -a],
-        [-a * b / (1.0 + c), 1.0 - b * b / (1.0 + c), -b],
-        [a, b, c],
-    ])  # fmt: skip

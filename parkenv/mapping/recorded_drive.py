@@ -36,9 +36,8 @@ from parkenv.mapping.laser_scans import Scan, common_scanner, mirrored, scan_of,
 from parkenv.mapping.point_clouds import SCANNER, CloudScan, Road, fit_road, points_of, scan_of_cloud
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey import SessionMap
-from parkenv.perception.detector import Detector
 from parkenv.perception.monocular import RangingErrors
-from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult
+from parkenv.perception.pipeline import CameraView, PerceptionResult
 from parkenv.perception.slot_filter import SlotFilter, SlotStates
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import DAY_S
@@ -290,17 +289,13 @@ class RecordedDrive:
     def _capture(
         self, k: int, again: frozenset[str], parts: dict[str, Any]
     ) -> tuple[TimedCapture, FloatArray]:
-        stamp, pose, tilt = (
-            int(self._matched.stamps[k]),
-            self._matched.poses[k],
-            self._track.tilt(self._matched.stamps[k]),
-        )
-        frames = {
-            key: Frame(image, _NO_DEPTH, _NO_DEPTH, _NO_IDS)
-            for key, image in parts.items()
-            if key.startswith("image:")
-        }
+        stamp, pose = int(self._matched.stamps[k]), self._matched.poses[k]
+        tilt = self._track.tilt(stamp)
         scans, tops, moved = {}, {}, {}
+
+        def frame(key: str) -> Frame:
+            return Frame(parts[key], _NO_DEPTH, _NO_DEPTH, _NO_IDS)
+
         for name, _, _ in self.rig.lasers:
             key = f"scan:{name}"
             index = self._matched.partners[key][k]
@@ -317,11 +312,9 @@ class RecordedDrive:
             tilt = cloud.tilt + self._track.tilt(stamp) - self._track.tilt(then)
         capture = Capture(
             pose,
-            {name: frames[f"image:{name}:mono"] for name, _, _ in self.rig.cameras},
-            {
-                name: StereoFrame(frames[f"image:{name}:left"], frames[f"image:{name}:right"])
-                for name, _, _ in self.rig.stereo_cameras
-            },
+            {name: frame(f"image:{name}:mono") for name, _, _ in self.rig.cameras},
+            {name: StereoFrame(frame(f"image:{name}:left"), frame(f"image:{name}:right"))
+             for name, _, _ in self.rig.stereo_cameras},
             scans, moved, again, tops, (float(tilt[0]), float(tilt[1])),
         )  # fmt: skip
         return TimedCapture(self.start + (stamp - int(self._stamps["pose"][0])) / 1e9, capture), pose
@@ -364,34 +357,6 @@ class RecordedDrive:
 
 
 def map_drive(
-    drive: RecordedDrive,
-    lot: ParkingLot,
-    detector: str | Detector | None = None,
-    every: float = 0.0,
-    on_frame: Callable[[], None] = lambda: None,
-    localise: str = "none",
-) -> MappedDrive:
-    """Run the perception pipeline and the mapping on a recorded drive, with captures at least `every` m apart.
-
-    What corrects the recorded poses is `none`, or `scan-matching`, for which they are drifting odometry. `on_frame` is
-    called after every capture.
-    """
-    require_ranges(drive, localise)
-    mapped = SessionMap(
-        PerceptionPipeline(drive.rig, lot, detector, drive.errors, on_streets=drive.head is None),
-        lot,
-        localise,
-    )
-    captures = drive.captures(every)
-    return mapped_drive(drive, lot, mapped, ((mapped.add(*one), one[1]) for one in captures), on_frame)
-
-
-def require_ranges(drive: RecordedDrive, localise: str) -> None:
-    if localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
-        raise InputError(f"localise is {localise!r}, want none: {drive.path} has no laser nor stereo camera")
-
-
-def mapped_drive(
     drive: RecordedDrive,
     lot: ParkingLot,
     mapped: SessionMap,

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
@@ -175,11 +176,9 @@ def _between(
     a: FloatArray, b: FloatArray, u: FloatArray, v: FloatArray, share: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return points of the cubic curve from a to b with directions u and v at its ends, and its directions there."""
-    s, reach = share[:, None], math.hypot(*(b - a))
-    p, q = reach * u, reach * v
-    xy = a + s * p + s**2 * (3.0 * (b - a) - 2.0 * p - q) + s**3 * (2.0 * (a - b) + p + q)
-    way = p + 2.0 * s * (3.0 * (b - a) - 2.0 * p - q) + 3.0 * s**2 * (2.0 * (a - b) + p + q)
-    return xy, way / np.hypot(way[:, :1], way[:, 1:])
+    curve = CubicHermiteSpline([0.0, 1.0], [a, b], math.hypot(*(b - a)) * np.array([u, v]))
+    way = curve(share, 1)
+    return curve(share), way / np.hypot(way[:, :1], way[:, 1:])
 
 
 def _outward(xy: FloatArray, way: FloatArray, path: shapely.MultiLineString) -> FloatArray:

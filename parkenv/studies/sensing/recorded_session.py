@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
@@ -15,17 +18,20 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import lot_format
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.drive_folders import source_of
-from parkenv.mapping.inference import predict
+from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.map_files import week_time, write_grid, write_slots
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.mapping.recorded_drive import CAR_COLUMNS, MappedDrive, RecordedDrive, map_drive
 from parkenv.mapping.store import MapStore
+from parkenv.mapping.survey import SessionMap
 from parkenv.perception.detector_registry import make_detector
+from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.scenarios.build import make_scenario
 from parkenv.show.figures.survey import save_map
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import MAP_FILE
 from parkenv.studies.study import Progress, counted
+from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
 
 SIGHTING_COLUMNS = (
@@ -59,22 +65,41 @@ def add_recording(
     progress("Reading", 0, 0)
     is_geographic = lot_file is not None and lot_format(lot_file) == "native"
     frame = read_contents(lot_file).frame if lot_file is not None and is_geographic else None
-    drive = read_drive(recording, calibration, photos, frame)
+    drive = read_drive(recording, calibration, photos, frame, localise)
     scenario = scenario or _scenario_of(drive)
     drive.require_near(scenario.lot)
     make_folder(folder)
     with MapStore(folder / MAP_FILE, scenario.lot) as store:
         require(not store.has(drive.key), f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
-        found = map_drive(drive, scenario.lot, finder, every, counted(progress, "Mapping"), localise)
+        pipeline = PerceptionPipeline(drive.rig, scenario.lot, finder, drive.errors)
+        mapped = SessionMap(pipeline, scenario.lot, localise)
+        results = ((mapped.add(*one), one[1]) for one in drive.captures(every))
+        found = map_drive(drive, scenario.lot, mapped, results, counted(progress, "Mapping"))
         store.add(found.session)
         log = store.log()
     title = f"{scenario.name}, {week_time(found.session.time)}"
     save_map(scenario.lot, predict(log, found.session.time), None, title, folder / "slots.png")
-    write_csv(folder / "cars.csv", CAR_COLUMNS, found.cars)
-    write_csv(folder / "sightings.csv", SIGHTING_COLUMNS, found.sightings)
-    write_grid(found.grid, folder)
-    write_slots(folder / "slots.geojson", scenario.lot, log, frame)
+    write_drives(folder, scenario.lot, log, frame, [found])
     return drive_row(drive, found)
+
+
+def write_drives(
+    folder: Path,
+    lot: ParkingLot,
+    log: SessionLog,
+    frame: LocalFrame | None,
+    drives: Sequence[MappedDrive],
+    of_slots: Sequence[dict[str, Any]] = (),
+    kerbs: Sequence[FloatArray] = (),
+) -> None:
+    """Write the slots of a map, and the cars and the occupancy grid of its new drives."""
+    write_slots(folder / "slots.geojson", lot, log, frame, of_slots, kerbs)
+    write_csv(folder / "cars.csv", CAR_COLUMNS, [row for one in drives for row in one.cars])
+    write_csv(folder / "sightings.csv", SIGHTING_COLUMNS, [row for one in drives for row in one.sightings])
+    grid = drives[-1].grid
+    for one in drives[:-1]:
+        grid.merge(one.grid)
+    write_grid(grid, folder)
 
 
 def read_drive(
@@ -82,13 +107,20 @@ def read_drive(
     calibration: DriveCalibration | None,
     photos: PhotoOptions | None,
     frame: LocalFrame | None,
+    localise: LocaliserName,
 ) -> RecordedDrive:
-    """Read a recording, or photographs with poses; the frame says where poses in degrees are, None: around them."""
+    """Read a recording, or photographs with poses; the frame says where poses in degrees are, None: around them.
+
+    What corrects the recorded poses is `none`, or `scan-matching`, for which they are drifting odometry.
+    """
     photos = photos or PhotoOptions()
     if photos.origin is not None:
         frame = LocalFrame(photos.origin[1], photos.origin[0])
     source = source_of(recording, calibration, photos, frame)
-    return RecordedDrive(recording, calibration, source, frame)
+    drive = RecordedDrive(recording, calibration, source, frame)
+    if localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
+        raise InputError(f"localise is {localise!r}, want none: {recording} has no laser nor stereo camera")
+    return drive
 
 
 def _scenario_of(drive: RecordedDrive) -> Scenario:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, require
 from parkenv.files.atomic_write import make_folder, write_together
-from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import LocaliserName
 from parkenv.files.limited_reading import read_json
+from parkenv.files.spec_file import Several, Spec
 from parkenv.lots.draft import Provenance
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import Slots
@@ -22,14 +24,11 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import read_lot
 from parkenv.mapping.car_tracks import CarTracks, ParkedCars
 from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.map_files import write_grid, write_slots
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.mapping.recorded_drive import (
-    CAR_COLUMNS,
     MappedDrive,
     RecordedDrive,
-    mapped_drive,
-    require_ranges,
+    map_drive,
 )
 from parkenv.mapping.scan_matching import make_locate
 from parkenv.mapping.store import MapStore, Session
@@ -41,12 +40,12 @@ from parkenv.perception.detector_registry import make_detector
 from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
 from parkenv.perception.slot_filter import SlotFilter
 from parkenv.studies.results import Row
-from parkenv.studies.sensing.recorded_session import SIGHTING_COLUMNS, drive_row, read_drive
+from parkenv.studies.sensing.recorded_session import drive_row, read_drive, write_drives
 from parkenv.studies.sensing.sessions import MAP_FILE
 from parkenv.studies.study import Progress, counted
 from parkenv.world.lot import Lane, ParkingLot
 
-LOT_FILE, SLOTS_FILE = "lot.geojson", "slots.geojson"
+LOT_FILE = "lot.geojson"
 _SAME_M = 1.5  # m, within which a slot of an earlier map is the same
 _FREE = 0.3  # P(taken) below which scans show a place to be free
 
@@ -68,11 +67,18 @@ class _Located:
 class _Earlier:
     """The map of earlier drives past the same street."""
 
-    lot: ParkingLot
-    frame: LocalFrame | None
-    tracks: tuple[FloatArray, ...]
-    cars: ParkedCars
-    sessions: tuple[Session, ...]
+    lot: ParkingLot | None = None
+    frame: LocalFrame | None = None
+    tracks: tuple[FloatArray, ...] = ()
+    cars: tuple[ParkedCars, ...] = ()
+    sessions: tuple[Session, ...] = ()
+
+
+class _Drives(Spec):
+    """What a lot's file says of the drives that it was made of."""
+
+    origin: Several[float] | None = Field(min_length=2, max_length=2)  # latitude and longitude
+    tracks: Several[Several[Several[float]]]
 
 
 def discover_recordings(
@@ -94,24 +100,22 @@ def discover_recordings(
     """
     finder = make_detector(detector)
     progress("Reading", 0, 0)
-    earlier = _read_earlier(folder) if (folder / LOT_FILE).exists() else None
-    frame = earlier.frame if earlier else None
+    earlier = _read_earlier(folder) if (folder / LOT_FILE).exists() else _Earlier()
+    frame = earlier.frame
     drives: list[_Located] = []
     for recording in recordings:
-        drive = read_drive(recording, calibration, photos, frame)
+        drive = read_drive(recording, calibration, photos, frame, localise)
         frame = frame or drive.frame
-        known = {one.drive.key for one in drives} | {one.key for one in (earlier.sessions if earlier else ())}
+        known = {one.drive.key for one in drives} | {one.key for one in earlier.sessions}
         require(drive.key not in known, f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
         drives.append(_located(drive, finder, every, localise, progress))
-    tracks = [*(earlier.tracks if earlier else ()), *(one.track for one in drives)]
+    tracks = [*earlier.tracks, *(one.track for one in drives)]
     lanes = _lanes(streets, frame, tracks)
-    cars = [*([earlier.cars] if earlier else []), *(_parked_cars(one) for one in drives)]
+    cars = [*earlier.cars, *(_parked_cars(one) for one in drives)]
     found = discover_street(cars, tracks, lambda slots: _shown_free(slots, lanes, drives))
     lot, found = street_lot(folder.absolute().name, found, lanes, fit=streets is None)
-    same = _same_slots(lot, earlier.lot) if earlier else np.full(lot.n_slots, -1)
-    lot = _with_ids(lot, same, earlier.lot if earlier else None)
+    lot, sessions = _continued(lot, earlier)
     mapped = [_mapped(one, lot) for one in drives]
-    sessions = [*(_of_lot(session, same) for session in (earlier.sessions if earlier else ()))]
     sessions += [one.session for one in mapped]
     make_folder(folder)
     with write_together(folder) as beside:
@@ -134,22 +138,17 @@ def _lanes(streets: Path | None, frame: LocalFrame | None, tracks: Sequence[Floa
 def _located(
     drive: RecordedDrive, detector: Detector, every: float, localise: str, progress: Progress
 ) -> _Located:
-    require_ranges(drive, localise)
-    pipeline = PerceptionPipeline(drive.rig, None, detector, drive.errors, on_streets=drive.head is None)
+    """Locate the cars in each capture; results are without pictures, so that those of a whole drive can be kept."""
+    pipeline = PerceptionPipeline(drive.rig, None, detector, drive.errors)
     locate, results = make_locate(localise, None), []
     on_frame = counted(progress, "Locating cars")
     for captured, recorded in drive.captures(every):
-        results.append((_light(pipeline.locate(captured, locate(recorded))), recorded))
+        result = pipeline.locate(captured, locate(recorded))
+        captured = captured._replace(capture=replace(captured.capture, images={}, pairs={}))
+        views = tuple(replace(v, image=np.empty((0, 0, 3), np.uint8), stereo=None) for v in result.views)
+        results.append((replace(result, captured=captured, views=views), recorded))
         on_frame()
     return _Located(drive, pipeline, results)
-
-
-def _light(result: PerceptionResult) -> PerceptionResult:
-    """Return a result without pictures, so that those of a whole drive can be kept."""
-    captured = result.captured
-    captured = captured._replace(capture=replace(captured.capture, images={}, pairs={}))
-    views = tuple(replace(v, image=np.empty((0, 0, 3), np.uint8), stereo=None) for v in result.views)
-    return replace(result, captured=captured, views=views)
 
 
 def _parked_cars(located: _Located) -> ParkedCars:
@@ -166,7 +165,7 @@ def _mapped(located: _Located, lot: ParkingLot) -> MappedDrive:
         (mapped.record(located.pipeline.update_slots(mapped.slots, result)), recorded)
         for result, recorded in located.results
     )
-    return mapped_drive(located.drive, lot, mapped, results)
+    return map_drive(located.drive, lot, mapped, results)
 
 
 def _shown_free(slots: Slots, lanes: Sequence[Lane], drives: Sequence[_Located]) -> np.ndarray[Any, Any]:
@@ -186,26 +185,19 @@ def _shown_free(slots: Slots, lanes: Sequence[Lane], drives: Sequence[_Located])
     return np.asarray((slots.xy[:, None] == free[None]).all(axis=2).any(axis=1))
 
 
-def _same_slots(lot: ParkingLot, earlier: ParkingLot) -> np.ndarray[Any, Any]:
-    """Return the slot of an earlier lot at the place of each slot, (n_slots,); -1 for a new one."""
-    away = np.hypot(*(lot.slot_xy[:, None] - earlier.slot_xy[None]).transpose(2, 0, 1))
+def _continued(lot: ParkingLot, earlier: _Earlier) -> tuple[ParkingLot, list[Session]]:
+    """Give slots at the place of an earlier one its id and sessions, and others new ids."""
+    if earlier.lot is None:
+        return lot, []
+    away = np.hypot(*(lot.slot_xy[:, None] - earlier.lot.slot_xy[None]).transpose(2, 0, 1))
     nearest, back = away.argmin(axis=1), away.argmin(axis=0)
     is_same = (away.min(axis=1) <= _SAME_M) & (back[nearest] == np.arange(lot.n_slots))
-    return np.where(is_same, nearest, -1)
-
-
-def _with_ids(lot: ParkingLot, same: np.ndarray[Any, Any], earlier: ParkingLot | None) -> ParkingLot:
-    """Give slots of an earlier lot their ids, and others new ones."""
-    if earlier is None:
-        return lot
-    used = [int(name) for name in earlier.slot_ids if name.isdecimal()]
-    new = iter(range(max(used, default=0) + 1, max(used, default=0) + lot.n_slots + 1))
-    ids = tuple(earlier.slot_ids[k] if k >= 0 else str(next(new)) for k in same.tolist())
-    return replace(lot, slot_ids=ids)
-
-
-def _of_lot(session: Session, same: np.ndarray[Any, Any]) -> Session:
-    return replace(session, p_occupied=np.where(same >= 0, session.p_occupied[same], np.nan))
+    names = earlier.lot.slot_ids
+    new = count(1 + max((int(name) for name in names if name.isdecimal()), default=0))
+    ids = [names[k] if same else str(next(new)) for k, same in zip(nearest, is_same, strict=True)]
+    sessions = [replace(one, p_occupied=np.where(is_same, one.p_occupied[nearest], np.nan))
+                for one in earlier.sessions]  # fmt: skip
+    return replace(lot, slot_ids=tuple(ids)), sessions
 
 
 def _write(
@@ -250,46 +242,31 @@ def _write(
         for session in sessions:
             store.add(session)
         log = store.log()
-    write_slots(folder / SLOTS_FILE, lot, log, frame, of_slots, found.kerbs)
-    write_csv(folder / "cars.csv", CAR_COLUMNS, [row for one in mapped for row in one.cars])
-    write_csv(folder / "sightings.csv", SIGHTING_COLUMNS, [row for one in mapped for row in one.sightings])
-    grid = mapped[-1].grid
-    for one in mapped[:-1]:
-        grid.merge(one.grid)
-    write_grid(grid, folder)
+    write_drives(folder, lot, log, frame, mapped, of_slots, found.kerbs)
     save_street(lot, found, tracks, log, folder / "slots.png")
 
 
 def _read_earlier(folder: Path) -> _Earlier:
-    lot, document = read_lot(folder / LOT_FILE), read_json(folder / LOT_FILE)
-    drives = document.get("drives")
-    with naming(folder / LOT_FILE):
-        require(isinstance(drives, dict), "is no lot of --discover; want another --out")
-        try:
-            origin, tracks = (
-                drives["origin"],
-                tuple(np.array(track, np.float64) for track in drives["tracks"]),
-            )
-            of_slots = [f["properties"] for f in document["features"] if f["properties"]["kind"] == "slot"]
-            cars = [i for i, slot in enumerate(of_slots) if slot.get("from", GAP) != GAP]
-            table = np.array([[of_slots[i][name] for name in ("std_m", "sightings")] for i in cars]).reshape(
-                -1, 2
-            )
-            frame = None if origin is None else LocalFrame(origin[1], origin[0])
-            require(
-                all(track.ndim == 2 and track.shape[1] == 2 and np.isfinite(track).all() for track in tracks),
-                "x",
-            )
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise InputError(
-                f"the member drives, or a slot, is not as --discover wrote it: {error}"
-            ) from error
-    size = np.column_stack([lot.slot_length[cars], lot.slot_width[cars]])
-    unknown = np.zeros(len(cars))
+    file = folder / LOT_FILE
+    lot, document = read_lot(file), read_json(file)
+    with naming(file):
+        require(isinstance(document.get("drives"), dict), "is no lot of --discover; want another --out")
+    drives = _Drives.parse(document["drives"], f"{file}: drives")
+    of_slots = [f["properties"] for f in document["features"] if f["properties"]["kind"] == "slot"]
+    cars = [i for i, slot in enumerate(of_slots) if slot.get("from", GAP) != GAP]
+    try:
+        std, sightings = (
+            np.array([float(of_slots[i][name]) for i in cars]) for name in ("std_m", "sightings")
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file}: a slot is not as --discover wrote it: {error}") from error
+    size, unknown = np.column_stack([lot.slot_length[cars], lot.slot_width[cars]]), np.zeros(len(cars))
     known = ParkedCars(
-        lot.slot_xy[cars], lot.slot_yaw[cars] % np.pi, size, table[:, 0], np.ones(len(cars)),
-        table[:, 1].astype(np.int64), unknown, unknown,
+        lot.slot_xy[cars], lot.slot_yaw[cars] % np.pi, size, std, unknown + 1.0, sightings.astype(np.int64), unknown,
+        unknown,
     )  # fmt: skip
+    frame = LocalFrame(drives.origin[1], drives.origin[0]) if drives.origin else None
+    tracks = tuple(np.array(track).reshape(-1, 2) for track in drives.tracks)
     with MapStore(folder / MAP_FILE, lot, create=False) as store:
         require(not store.trips(), f"{folder / MAP_FILE}: holds searches in its slots; want another --out")
-        return _Earlier(lot, frame, tracks, known, tuple(store.sessions()))
+        return _Earlier(lot, frame, tracks, (known,), tuple(store.sessions()))
