@@ -136,19 +136,18 @@ def _stamps_in(table: Path, zone_s: float) -> dict[str, int]:
 
 def _scans(file: Path, key: str, stamps: dict[str, int]) -> list[tuple[int, Callable[[], Any]]]:
     arrays = read_arrays(file)
-    name = key or next((name for name in _RANGES if name in arrays), "")
-    angles = [arrays.get(n, np.empty(0)) for n in ("angle_min", "angle_step")]
-    usable = all(a.size == 1 and np.issubdtype(a.dtype, np.number) for a in angles)
-    if name not in arrays or "frame" not in arrays or not usable:
+    name = key or next((name for name in _RANGES if name in arrays), "ranges")
+    try:
+        start, step = (float(arrays[n].item()) for n in ("angle_min", "angle_step"))
+        ranges, frames = arrays[name], arrays["frame"]
+    except (KeyError, ValueError, TypeError) as error:
         wanted = "frame, angle_min, angle_step and ranges (m), ranges_mm, or `topic = FILE:ARRAY`"
-        raise InputError(f"{file}: has {', '.join(sorted(arrays))}, want {wanted}")
-    ranges, frames = arrays[name], arrays["frame"]
+        raise InputError(f"{file}: has {', '.join(sorted(arrays))}, want {wanted}") from error
     if ranges.ndim != 2 or len(ranges) != frames.size or not np.issubdtype(ranges.dtype, np.number):
         raise InputError(f"{file}: {name} has the shape {ranges.shape}, want {frames.size} rows")
     scale = 0.001 if np.issubdtype(ranges.dtype, np.integer) else _RANGES.get(name, 1.0)
     metres = (ranges * scale).astype(np.float32)
     most = float(np.where(np.isfinite(metres), metres, 0.0).max(initial=0.0)) + 0.01
-    start, step = (float(a.item()) for a in angles)
     scan = partial(SimpleNamespace, angle_min=start, angle_increment=step, range_min=0.0, range_max=most)
     at = [stamps.get(number_of(str(frame))) for frame in frames.ravel().tolist()]
     timed = {stamp: row for row, stamp in zip(metres, at, strict=True) if stamp is not None}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -84,8 +84,7 @@ def set_up_survey(rig: str, types: dict[str, str]) -> DriveSetup:
         raise InputError(f"names no rig of {', '.join(RIG_NAMES)}")
     named = SensorRig.named(rig)
     topics = topics_of(named)
-    if missing := [topic for topic in topics.values() if topic not in types]:
-        raise InputError(f"has no {missing[0]}, which its rig has")
+    _require(topics, types)
     cameras = {f"image:{name}:mono": camera for name, camera, _ in named.cameras}
     for name, pair, _ in named.stereo_cameras:
         cameras |= {f"image:{name}:{side}": pair.camera for side in ("left", "right")}
@@ -112,7 +111,7 @@ def set_up(
     topics, base = {}, given.base
     if source.poses is None:
         topics = {"pose": found.pose(given)}
-        base = base or found.base(topics["pose"])
+        base = base or found.base_of(topics["pose"])
         imu = given.imu or "".join(found.of(IMU)[:1])
         if imu and types.get(topics["pose"]) == NAV_FIX:
             topics["imu"] = imu
@@ -120,9 +119,10 @@ def set_up(
     topics |= {f"image:{camera.name}:mono": camera.topic for camera in chosen.cameras}
     for pair in chosen.stereo_cameras:
         topics |= {f"image:{pair.name}:left": pair.left, f"image:{pair.name}:right": pair.right}
-    found.require(topics)
     with naming(path):
-        setup = DriveSetup(topics, tree=found.tree, base=found.tree.base(base))
+        _require(topics, types)
+        found.base = found.tree.base(base)
+    setup = DriveSetup(topics, tree=found.tree, base=found.base)
     try:
         found.place_lasers(setup, chosen)
         for camera in chosen.cameras:
@@ -143,7 +143,8 @@ class _Recording:
         self._path, self._types, self._messages = path, types, messages
         self.tree, self.infos = source.tree, dict(source.infos)
         self._unplaced = set[str]()  # names of sensors that no file describes
-        self._base_height = 0.0
+        self.base: str | None = None  # frame of the vehicle
+        self._base_height = 0.0  # m, of it above the road
         for topic in self.of(*TRANSFORMS):
             with naming(f"{path}: {topic}"):
                 for _, _, message in messages({topic}):
@@ -162,24 +163,14 @@ class _Recording:
     def error(self, text: str) -> InputError:
         return InputError(f"{self._path}: {text}")
 
-    def listed(self, topics: Iterable[str] = ()) -> str:
-        there = [f"{topic} ({self._types[topic]})" for topic in sorted(topics or self._types)]
-        return ", ".join(there[:_LISTED]) or "nothing"
-
     def only(self, what: str, topics: list[str]) -> str:
         if not topics:
-            raise self.error(f"has no {what}; it has {self.listed()}")
+            raise self.error(f"has no {what}; it has {_listed(self._types)}")
         if len(topics) > 1:
-            raise self.error(f"has {len(topics)} {what}s, {self.listed(topics)}; {_HOW}")
+            raise self.error(
+                f"has {len(topics)} {what}s, {_listed({topic: self._types[topic] for topic in topics})}; {_HOW}"
+            )
         return topics[0]
-
-    def require(self, topics: dict[str, str]) -> None:
-        for key, topic in topics.items():
-            kind = key.partition(":")[0]
-            kinds = {"pose": (*POSES, NAV_FIX, *TRANSFORMS), "imu": (IMU,)}.get(kind) or SENSORS[kind]
-            if self._types.get(topic) not in kinds:
-                wanted = " or ".join(kinds)
-                raise self.error(f"has no {kind}s in {topic}, want {wanted}; it has {self.listed()}")
 
     def pose(self, given: DriveCalibration) -> str:
         """Return the topic of the poses: as named, else by its type."""
@@ -192,10 +183,10 @@ class _Recording:
             return moving[0]
         if not fixes:
             wanted = ", ".join(kind.rpartition("/")[2] for kind in (*POSES, NAV_FIX))
-            raise self.error(f"has no poses, want {wanted} or /tf; it has {self.listed()}")
+            raise self.error(f"has no poses, want {wanted} or /tf; it has {_listed(self._types)}")
         return self.only("satellite receiver", fixes)
 
-    def base(self, pose: str) -> str | None:
+    def base_of(self, pose: str) -> str | None:
         """Return the frame that poses are of, if they say it and transforms have it."""
         message = self._first(pose)
         frame = getattr(message, "child_frame_id", "")
@@ -232,7 +223,7 @@ class _Recording:
 
     def _with_pair(self, spec: StereoSpec) -> StereoSpec:
         if len(pairs := self._pairs()) != 1:
-            raise self.error(f"{spec.name}: want `left` and `right`; it has {self.listed()}")
+            raise self.error(f"{spec.name}: want `left` and `right`; it has {_listed(self._types)}")
         return spec.model_copy(update=dict(zip(("left", "right"), pairs[0], strict=True)))
 
     def _pictures(self) -> list[str]:
@@ -252,16 +243,16 @@ class _Recording:
         names = plain, f"{plain.rpartition('/')[0]}/camera_info", f"{plain}/camera_info"
         return next((self.infos[name] for name in names if name in self.infos), None)
 
-    def _at(self, setup: DriveSetup, spec: SizedLens | LaserSpec, topic: str) -> FloatArray | None:
+    def _at(self, spec: SizedLens | LaserSpec, topic: str) -> FloatArray | None:
         """Return the pose of a sensor's frame in that of the vehicle, (4, 4), if transforms count and say it."""
-        if setup.base is None or "mount" in spec.model_fields_set:
+        if self.base is None or "mount" in spec.model_fields_set:
             return None
         header = getattr(self._first(topic), "header", None)
-        return self.tree.between(setup.base, header.frame_id.strip("/") if header else topic)
+        return self.tree.between(self.base, header.frame_id.strip("/") if header else topic)
 
-    def _place(self, setup: DriveSetup, spec: SizedLens | LaserSpec, topic: str) -> Placed:
+    def _place(self, spec: SizedLens | LaserSpec, topic: str) -> Placed:
         """Return where a sensor is: as the file says, else by the frames, else the usual place of a named sensor."""
-        at = self._at(setup, spec, topic)
+        at = self._at(spec, topic)
         if at is None:
             if spec.name in self._unplaced:
                 raise self.error(
@@ -280,16 +271,16 @@ class _Recording:
             self._base_height = calibration.base_height
         else:
             clouds = [one for one in calibration.lasers if one.name in setup.clouds]
-            heights = [height for one in clouds for height in self._heights(setup, one)]
-            self._base_height = float(np.median(heights or [self.tree.height(setup.base or "")]))
+            heights = [height for one in clouds for height in self._heights(one)]
+            self._base_height = float(np.median(heights or [self.tree.height(self.base or "")]))
         for spec in calibration.lasers:
-            placed = setup.lasers[spec.name] = self._place(setup, spec, spec.topic)
+            placed = setup.lasers[spec.name] = self._place(spec, spec.topic)
             if spec.name not in setup.clouds and abs(np.cos(placed.roll)) < np.cos(np.radians(20.0)):
                 raise self.error(f"{spec.topic}: is rolled by {np.degrees(placed.roll):.0f}°, want 0 or 180")
 
-    def _heights(self, setup: DriveSetup, spec: LaserSpec) -> Iterator[float]:
+    def _heights(self, spec: LaserSpec) -> Iterator[float]:
         """Yield how high above the road the vehicle's frame is, m, in the first clouds of a sensor."""
-        at = self._at(setup, spec, spec.topic)
+        at = self._at(spec, spec.topic)
         if at is not None:
             turn = at[:3, :3].T.astype(np.float32)
             with naming(f"{self._path}: {spec.topic}"):
@@ -299,7 +290,7 @@ class _Recording:
 
     def add_camera(self, setup: DriveSetup, spec: CameraSpec) -> None:
         picture, turn = self._picture(spec, spec.topic)
-        placed = self._place(setup, spec, spec.topic).turned(turn)
+        placed = self._place(spec, spec.topic).turned(turn)
         setup.pictures[f"image:{spec.name}:mono"] = picture.levelled(placed.roll)
         setup.cameras.append((spec.name, picture.camera, placed.mount))
 
@@ -322,7 +313,7 @@ class _Recording:
             raise InputError(f"{spec.name}: has distortion, want {wanted}")
         if baseline is None:
             raise InputError(f"{spec.name}: baseline is missing, want the distance of its cameras, m")
-        placed = self._place(setup, spec, spec.left).turned(turn)
+        placed = self._place(spec, spec.left).turned(turn)
         if abs(placed.roll) > _MOST_ROLL:
             raise InputError(
                 f"{spec.name}: mount.roll is {np.degrees(placed.roll):.1f}, want at most 5 degrees"
@@ -342,6 +333,19 @@ class _Recording:
                 raise self.error(f"{topic} has no CameraInfo; want {wanted}")
             own = info.picture(topic)
         return own, own.rotation
+
+
+def _listed(types: dict[str, str]) -> str:
+    return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(types.items())[:_LISTED]) or "nothing"
+
+
+def _require(topics: dict[str, str], types: dict[str, str]) -> None:
+    for key, topic in topics.items():
+        kind = key.partition(":")[0]
+        kinds = {"pose": (*POSES, NAV_FIX, *TRANSFORMS), "imu": (IMU,)}.get(kind) or SENSORS[kind]
+        if types.get(topic) not in kinds:
+            wanted = " or ".join(kinds)
+            raise InputError(f"has no {kind}s in {topic}, want {wanted}; it has {_listed(types)}")
 
 
 def _right_of(topic: str) -> list[str]:

@@ -110,8 +110,6 @@ def common_scanner(scans: Sequence[Scan]) -> tuple[LaserScanner, list[Float32Arr
         scanner = LaserScanner(n, start, step, max(scan.max_range for scan in scans))
     except SensorError as error:
         raise InputError(str(error)) from error
-    if len(shapes) == 1:
-        return scanner, [scan.ranges for scan in scans]
     angles, ranges = scanner.angles, []
     for scan in scans:
         place = (angles - scan.start) % _TURN / scan.step

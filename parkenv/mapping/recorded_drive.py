@@ -62,7 +62,6 @@ class MappedDrive:
     grid: OccupancyGrid  # the occupancy grid
     frames: int  # captures that were used
     corrected_m: float  # m, greatest distance between a recorded pose and what it was corrected to
-    parked: ParkedCars  # the cars it has passed
     cars: list[dict[str, Any]]  # of each: place, size, errors and slot
     sightings: list[dict[str, Any]]  # of each car located in a picture: the same, and the time
 
@@ -171,7 +170,8 @@ class RecordedDrive:
             raise InputError(f"{where}: pose {bad + 1} is {poses[bad, :3].tolist()}")
         if self.calibration is not None:
             at = self.calibration.origin
-            poses[:, :3] = placed(np.array([at.x, at.y, math.radians(at.yaw)]), poses[:, :3])
+            moved = placed(np.array([at.x, at.y, math.radians(at.yaw)]), poses[:, :3])
+            poses = np.column_stack([moved, poses[:, 3:]])
         self._track = PoseTrack(self._stamps["pose"], poses)
         self.poses = self._track.poses
         scanners = dict.fromkeys(self._setup.clouds, SCANNER)
@@ -376,7 +376,7 @@ def map_drive(
     session = mapped.session(drive.key, drive.start, rig, weather)
     parked = tracks.cars(drive.poses[:, :2])
     return MappedDrive(
-        session, mapped.slots.states(), mapped.grid, len(shifts), float(max(shifts, default=0.0)), parked,
+        session, mapped.slots.states(), mapped.grid, len(shifts), float(max(shifts, default=0.0)),
         list(_rows_of(parked, lot, mapped.slots)), sightings,
     )  # fmt: skip
 

@@ -62,6 +62,13 @@ class _Located:
     def track(self) -> FloatArray:
         return np.array([result.vehicle[:2] for result, _ in self.results])
 
+    def cars(self) -> ParkedCars:
+        tracks = CarTracks()
+        for result, _ in self.results:
+            for view in result.views:
+                tracks.add(result.captured.time, view)
+        return tracks.cars(self.track)
+
 
 @dataclass(frozen=True, eq=False)
 class _Earlier:
@@ -110,8 +117,10 @@ def discover_recordings(
         require(drive.key not in known, f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
         drives.append(_located(drive, finder, every, localise, progress))
     tracks = [*earlier.tracks, *(one.track for one in drives)]
-    lanes = _lanes(streets, frame, tracks)
-    cars = [*earlier.cars, *(_parked_cars(one) for one in drives)]
+    if streets is not None and frame is None:
+        raise InputError(f"{streets}: is in degrees, and the poses are in metres; want poses in degrees")
+    lanes = driven_lanes(tracks) if streets is None or frame is None else mapped_lanes(streets, frame, tracks)
+    cars = [*earlier.cars, *(one.cars() for one in drives)]
     found = discover_street(cars, tracks, lambda slots: _shown_free(slots, lanes, drives))
     lot, found = street_lot(folder.absolute().name, found, lanes, fit=streets is None)
     lot, sessions = _continued(lot, earlier)
@@ -125,14 +134,6 @@ def discover_recordings(
                                           "guessed": int((found.source != CAR).sum())}
         for one, of_drive in zip(drives, mapped, strict=True)
     ]  # fmt: skip
-
-
-def _lanes(streets: Path | None, frame: LocalFrame | None, tracks: Sequence[FloatArray]) -> list[Lane]:
-    if streets is None:
-        return driven_lanes(tracks)
-    if frame is None:
-        raise InputError(f"{streets}: is in degrees, and the poses are in metres; want poses in degrees")
-    return mapped_lanes(streets, frame, tracks)
 
 
 def _located(
@@ -149,14 +150,6 @@ def _located(
         results.append((replace(result, captured=captured, views=views), recorded))
         on_frame()
     return _Located(drive, pipeline, results)
-
-
-def _parked_cars(located: _Located) -> ParkedCars:
-    tracks = CarTracks()
-    for result, _ in located.results:
-        for view in result.views:
-            tracks.add(result.captured.time, view)
-    return tracks.cars(located.track)
 
 
 def _mapped(located: _Located, lot: ParkingLot) -> MappedDrive:
