@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import parkenv, ran
+from command_line import ran
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -192,7 +192,6 @@ def test_a_street_is_mapped_without_a_lot_and_refined_by_later_drives(tmp_path):
         file = tmp_path / f"{seed}.mcap"
         drive = f"survey --scenario mini --sessions 1 --seed {seed} --every 2 --weather sunny --record"
         ran(drive, file, "--out", tmp_path / f"survey {seed}")
-        assert "want --lot FILE" in " ".join(parkenv("map-drive", file, "--out", out).stderr.split())
         ran("map-drive --discover", file, "--out", out)
         lot = read_lot(out / "lot.geojson")
         n_slots.append(lot.n_slots)

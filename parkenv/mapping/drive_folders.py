@@ -71,7 +71,8 @@ def _with_poses(
 ) -> tuple[Track, Callable[..., Source]]:
     """Return the poses of a folder or film, and what makes a source of the rest; those without heading are left out."""
     folder = path if path.is_dir() else path.parent
-    poses = options.poses or _there(folder, calibration.pose) or folder / _POSES
+    named = _there(folder, calibration.pose)
+    poses = options.poses or (named if named and named.is_file() else folder / _POSES)
     if options.poses is None and not poses.is_file():
         raise InputError(
             f"{path}: has no poses, want --poses FILE (.csv, .gpx), or {_POSES} beside the pictures"

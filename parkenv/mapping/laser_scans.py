@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.errors import InputError
@@ -78,13 +79,8 @@ def without_motion(scan: Scan, moved: FloatArray) -> Scan:
     y = moved[hit, 1] + scan.ranges[hit] * np.sin(angle)
     middle = 0.5 * (beams[0] + beams[-1])
     place = (np.arctan2(y, x) - middle + math.pi) % _TURN + middle - math.pi
-    order = np.argsort(place, kind="stable")
-    place, distance = place[order], np.hypot(x, y)[order]
-    after = np.searchsorted(place, beams)
-    sides = np.stack([np.maximum(after - 1, 0), np.minimum(after, len(place) - 1)])
-    off = np.abs(place[sides] - beams)
-    near = np.take_along_axis(sides, off.argmin(axis=0)[None], axis=0)[0]
-    ranges = np.where(off.min(axis=0) <= scan.step, distance[near], np.inf)
+    off, near = cKDTree(place[:, None]).query(beams[:, None])
+    ranges = np.where(off <= scan.step, np.hypot(x, y)[near], np.inf)
     return scan._replace(ranges=ranges.astype(np.float32))
 
 
