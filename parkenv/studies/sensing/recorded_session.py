@@ -71,7 +71,9 @@ def add_recording(
     make_folder(folder)
     with MapStore(folder / MAP_FILE, scenario.lot) as store:
         require(not store.has(drive.key), f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
-        pipeline = PerceptionPipeline(drive.rig, scenario.lot, finder, drive.errors)
+        pipeline = PerceptionPipeline(
+            drive.rig, scenario.lot, finder, drive.errors, on_streets=drive.head is None
+        )
         mapped = SessionMap(pipeline, scenario.lot, localise)
         results = ((mapped.add(*one), one[1]) for one in drive.captures(every))
         found = map_drive(drive, scenario.lot, mapped, results, counted(progress, "Mapping"))

@@ -140,7 +140,7 @@ def _located(
     drive: RecordedDrive, detector: Detector, every: float, localise: str, progress: Progress
 ) -> _Located:
     """Locate the cars in each capture; results are without pictures, so that those of a whole drive can be kept."""
-    pipeline = PerceptionPipeline(drive.rig, None, detector, drive.errors)
+    pipeline = PerceptionPipeline(drive.rig, None, detector, drive.errors, on_streets=drive.head is None)
     locate, results = make_locate(localise, None), []
     on_frame = counted(progress, "Locating cars")
     for captured, recorded in drive.captures(every):
