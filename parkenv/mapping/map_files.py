@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.files.atomic_write import atomic_write, write_text
+from parkenv.lots.formats.geojson import write_features
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.inference import SessionLog, predict
@@ -80,8 +80,7 @@ def write_slots(
         features.append(feature("Polygon", ring, properties | dict(of_slots[i] if of_slots else {})))
     features += [feature("LineString", kerb, {"kind": "kerb"}) for kerb in kerbs]
     head = {"type": "FeatureCollection", "name": lot.name} | ({"frame": "local"} if frame is None else {})
-    lines = ",\n".join(map(json.dumps, features))
-    write_text(path, f'{json.dumps(head)[:-1]},\n"features": [\n{lines}\n]}}\n')
+    write_features(path, head, features)
 
 
 def week_time(time: float) -> str:

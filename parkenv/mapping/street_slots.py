@@ -18,6 +18,7 @@ from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.mapping.car_rows import CarRow, aligned, along_track, axis_of, car_rows, steps_to_line
 from parkenv.mapping.car_tracks import ParkedCars
 from parkenv.mapping.discovery import discover
+from parkenv.perception.box_fit import CAR_LENGTH
 from parkenv.world.lot import Mouth
 
 CAR, ONCE, LONE_CAR, GAP = "car", "car seen once", "lone car", "gap"
@@ -25,7 +26,6 @@ CAR, ONCE, LONE_CAR, GAP = "car", "car seen once", "lone car", "gap"
 SIDE = (5.2, 2.0)  # length and width, m, of a slot along the kerb
 END = (5.0, 2.5)  # the same of one across or at an angle
 GAP_M = 5.4  # m, room between two cars along the kerb that one more needs
-CAR_LENGTH_M = 4.4
 PITCH_M = (2.2, 2.5, 3.4)  # least, usual and largest distance of slots across the kerb
 MOST_GAPS_M = 17.0  # m, room that is filled with guessed slots without evidence: more may be a side street
 MOST_STD_M = 1.0  # of cars that stay where they are
@@ -137,10 +137,10 @@ def _slots_of(
     centres, ways, sources = [at[:1]], [along[:1]], [CAR if len(at) > 1 else LONE_CAR]
     ends: list[bool] = []  # whether what is beside each slot is unknown
     for (a, b), (u, v), distance in zip(pairwise(at), pairwise(along), apart.tolist(), strict=True):
-        room = distance - CAR_LENGTH_M if kerbside else distance - pitch
+        room = distance - CAR_LENGTH if kerbside else distance - pitch
         n = math.floor(room / GAP_M + 1e-9) if kerbside else max(round(room / pitch), 0)
         n -= not kerbside and distance / (n + 1) < PITCH_M[0] and n > 0
-        first = (0.5 * CAR_LENGTH_M + 0.5 * room / max(n, 1)) / distance if kerbside else 1.0 / (n + 1)
+        first = (0.5 * CAR_LENGTH + 0.5 * room / max(n, 1)) / distance if kerbside else 1.0 / (n + 1)
         share = first + np.arange(n) * (room / max(n, 1) / distance if kerbside else first)
         xy, way = _between(a, b, u, v, share)
         if n * (GAP_M if kerbside else pitch) > MOST_GAPS_M:

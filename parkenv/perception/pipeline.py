@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
-from parkenv.errors import InputError, require
+from parkenv.errors import InputError
 from parkenv.perception.detector import (
     PROBABILITY,
     BandDetector,
@@ -201,8 +201,8 @@ class PerceptionPipeline:
         Returns:
             The result of each capture, and the observed slots with their states.
         """
-        require(self.lot is not None, "the pipeline has no lot, want one with the slots to observe")
-        assert self.lot is not None
+        if self.lot is None:
+            raise InputError("the pipeline has no lot, want one with the slots to observe")
         slots = SlotFilter(self.lot)
         seen = in_threads(self._look, captures) if self._concurrent else map(self._look, captures)
         results = tuple(

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -95,6 +95,11 @@ def write_lot(
     features = [*_features(lot)]
     for feature, properties in zip(features, of_slots, strict=False):  # slots come first
         feature["properties"] |= properties
+    write_features(path, head, features)
+
+
+def write_features(path: Path, head: Mapping[str, Any], features: Iterable[Mapping[str, Any]]) -> None:
+    """Write a FeatureCollection with other members, atomically, a line for each feature."""
     lines = ",\n".join(map(json.dumps, features))
     write_text(path, f'{json.dumps(head)[:-1]},\n"features": [\n{lines}\n]}}\n')
 
