@@ -1,6 +1,7 @@
 """Cars of a drive are joined over captures: one car, one place, with its error."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -119,6 +120,10 @@ def test_a_laser_beside_the_camera_locates_the_same_cars(at):
     box = np.array([[CAMERA.cx - half, top, CAMERA.cx + half, bottom]])
     cars = localize_cars(Detections(box, np.float32([0.9])), scan, CAMERA, mount, vehicle)
     assert np.allclose(cars.xy, [[0.0, -5.0]], atol=0.1)
+    for height, cars in ((1.4, 1), (0.4, 0), (2.6, 0)):  # a car, a step before the box, and a house behind it
+        high = replace(scan, tops=np.full(len(scan.angle), height))
+        found = localize_cars(Detections(box, np.float32([0.9])), high, CAMERA, mount, vehicle)
+        assert len(found) == cars
 
 
 def test_what_hides_from_the_other_point_is_left_out_of_a_scan():

@@ -8,10 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from command_line import parkenv
+from numba import config, get_num_threads, set_num_threads
 from onnx import TensorProto, helper, numpy_helper
 from tiny_networks import SIZE, Tiny
 
 from parkenv import InputError, make_scenario
+from parkenv.compiled.threads import ahead_in_threads
 from parkenv.perception.detector_registry import detector_version, make_detector
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.compare.comparison import Comparison
@@ -66,6 +68,19 @@ def iou(a, b):
     wide, high = (min(a[i + 2], b[i + 2]) - max(a[i], b[i]) for i in (0, 1))
     common = max(wide, 0.0) * max(high, 0.0)
     return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
+
+
+def test_threads_share_a_network_and_leave_opencv_as_it_was(tmp_path):
+    detector = make_detector(str(Tiny().save(tmp_path / "tiny.onnx")))
+    pictures, threads = [photo(seed=seed) for seed in range(12)], cv2.getNumThreads()
+    before = get_num_threads()
+    set_num_threads(min(2, config.NUMBA_NUM_THREADS))
+    found = list(ahead_in_threads(detector.detect, iter(pictures)))
+    set_num_threads(before)
+    assert [picture is one for (picture, _), one in zip(found, pictures, strict=True)] == [True] * 12
+    for picture, of_threads in found:
+        np.testing.assert_array_equal(of_threads.boxes, detector.detect(picture).boxes)
+    assert cv2.getNumThreads() == threads
 
 
 @pytest.mark.parametrize(

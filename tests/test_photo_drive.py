@@ -15,21 +15,23 @@ from PIL import Image
 from parkenv import InputError, make_scenario
 from parkenv.files.tracks import read_track
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.mapping.drive_folders import source_of
-from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.recorded_drive import RecordedDrive
+from parkenv.mapping.recordings.folders import source_of
+from parkenv.mapping.recordings.photo_options import PhotoOptions
+from parkenv.mapping.recordings.recorded_drive import RecordedDrive
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.perception.detector import Detections, DetectorErrors
 from parkenv.perception.hog_detector import HogDetector
 from parkenv.perception.monocular import (
     HEIGHT,
+    STREET_PITCH,
     GroundView,
     RangingErrors,
     UsualCars,
     corners_of_cars,
     distances_ahead,
     localize_boxes,
+    street_pitch,
 )
 from parkenv.perception.slot_filter import P_OCCUPIED, SlotFilter
 from sim_sensors.camera.models import PinholeCamera
@@ -108,6 +110,21 @@ def test_boxes_that_end_above_the_horizon_are_no_cars(detector, pitch):
         box = np.array([[500.0, bottom - tall, 820.0, bottom]]) + tall * np.array(detector.shift)
         found = Detections(box, np.ones(1), np.ones(1, np.bool_))
         assert len(localize_boxes(found, ground, np.zeros(3), RangingErrors(detector))) == cars
+
+
+@pytest.mark.parametrize("raised", [-1.0, 0.0, 1.0])
+def test_cars_of_a_street_tell_how_high_the_camera_looks(raised):
+    """Their height does, however far away they are; without a car nothing does."""
+    true, said = view_of(pitch=-2.0 + raised), view_of(pitch=-2.0)
+    boxes = np.array(
+        [usual_box(true, ahead, aside, 2) for ahead in (7.0, 10.0, 14.0) for aside in (-1.0, 1.0)]
+    )
+    sure = np.ones(len(boxes), np.float32)
+    seen = [(Detections(boxes[k : k + 1], sure[:1], sure[:1] > 0), said) for k in range(len(boxes))] * 5
+    pitch, error = street_pitch(seen, RangingErrors())
+    assert math.degrees(pitch) == pytest.approx(raised, abs=0.25)
+    assert error < 0.6 * STREET_PITCH
+    assert street_pitch([], RangingErrors()) == (0.0, STREET_PITCH)
 
 
 def before_a_slot(away):

@@ -12,13 +12,13 @@ from command_line import parkenv, ran, summary_of
 from parkenv import InputError, make_scenario
 from parkenv.files.recordings import footage_in
 from parkenv.files.videos import Video
-from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.drive_folders import source_of
-from parkenv.mapping.drive_poses import pose_of
-from parkenv.mapping.drive_writer import Head, recording
-from parkenv.mapping.laser_scans import common_scanner, scan_of
-from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.recorded_drive import RecordedDrive
+from parkenv.mapping.recordings.calibration import DriveCalibration
+from parkenv.mapping.recordings.folders import source_of
+from parkenv.mapping.recordings.laser_scans import common_scanner, scan_of
+from parkenv.mapping.recordings.photo_options import PhotoOptions
+from parkenv.mapping.recordings.poses import pose_of
+from parkenv.mapping.recordings.recorded_drive import RecordedDrive
+from parkenv.mapping.recordings.writer import Head, recording
 from parkenv.mapping.store import MapStore
 from sim_sensors.camera.models import Frame
 from sim_sensors.rig import Capture, SensorRig, TimedCapture

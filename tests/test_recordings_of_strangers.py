@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from parkenv import InputError
 from parkenv.files.recordings import IMAGE, POSES, SCAN
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.drive_folders import source_of
-from parkenv.mapping.drive_setup import set_up
-from parkenv.mapping.laser_scans import Scan, mirrored, without_motion
-from parkenv.mapping.lenses import Picture, Placed, aligned_pair
-from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.point_clouds import SCANNER, fit_road, points_of, scan_of_cloud
-from parkenv.mapping.recorded_drive import RecordedDrive
+from parkenv.mapping.recordings.calibration import DriveCalibration
+from parkenv.mapping.recordings.folders import source_of
+from parkenv.mapping.recordings.laser_scans import Scan, mirrored, without_motion
+from parkenv.mapping.recordings.lenses import Picture, Placed, aligned_pair
+from parkenv.mapping.recordings.photo_options import PhotoOptions
+from parkenv.mapping.recordings.point_clouds import SCANNER, fit_road, points_of, scan_of_cloud
+from parkenv.mapping.recordings.recorded_drive import RecordedDrive
+from parkenv.mapping.recordings.setup import set_up
 from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.rig import Mount
 

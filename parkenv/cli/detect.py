@@ -116,7 +116,7 @@ class Detect(Command):
     def _on_ground(self, detector: Detector) -> Detector:
         if self.calibration is None:
             return detector
-        from parkenv.mapping.drive_calibration import DriveCalibration
+        from parkenv.mapping.recordings.calibration import DriveCalibration
         from parkenv.perception.ground_detector import GroundDetector
 
         return GroundDetector(detector, *DriveCalibration.read(self.calibration).only_camera())

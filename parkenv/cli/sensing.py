@@ -17,7 +17,7 @@ from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, LocaliserName, RigName, WeatherName
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.files.spec_file import Axis, Several
-from parkenv.mapping.photo_options import PhotoOptions
+from parkenv.mapping.recordings.photo_options import PhotoOptions
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
@@ -88,7 +88,7 @@ class MapDrive(Command):
     )
 
     def run(self) -> None:
-        from parkenv.mapping.drive_calibration import DriveCalibration
+        from parkenv.mapping.recordings.calibration import DriveCalibration
         from parkenv.scenarios.build import build
         from parkenv.studies.sensing.recorded_session import add_recording
         from parkenv.studies.sensing.street_discovery import discover_recordings

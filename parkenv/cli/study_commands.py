@@ -62,7 +62,7 @@ class Survey(StudyCommand):
         if self.record is None:
             self.run_study()
             return
-        from parkenv.mapping.drive_writer import record_drive, require_recordable
+        from parkenv.mapping.recordings.writer import record_drive, require_recordable
 
         require_recordable(self.record)
         self.run_study()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import TypeVar
 
@@ -31,6 +32,21 @@ def in_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Re
     finally:
         set_num_threads(n)
     return [first, *(one.result() for one in waiting)]
+
+
+def ahead_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
+    """Yield each item and its result, in their order; a few are worked on ahead, on as many cores as numba uses."""
+    n, waiting = get_num_threads(), deque[tuple[Item, Future[Result]]]()
+    if n == 1:
+        yield from ((item, work(item)) for item in items)
+        return
+    for item in items:
+        waiting.append((item, _pool(n).submit(work, item)))
+        if len(waiting) > n:
+            first, done = waiting.popleft()
+            yield first, done.result()
+    for first, done in waiting:
+        yield first, done.result()
 
 
 @lru_cache(maxsize=1)

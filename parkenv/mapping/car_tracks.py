@@ -44,7 +44,7 @@ _SEEN_STD, _ASSUMED_STD = (
     0.4,
 )  # m, of a centre between two seen ends, and of one that is half a usual car away
 _COMMON_STD = 0.12  # m, of errors that all sightings share, as that of poses
-_COMMON_SHARE = 0.5  # the same of sightings from pictures, as a fraction of the mean one
+_COMMON_SHARE = 0.8  # the same of sightings from pictures, as a fraction of the mean one
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,7 +120,8 @@ class Detector(Protocol):
     """Finds cars in camera images.
 
     A detector that misses more cars than a network, or whose boxes are less tight, has an attribute `errors`
-    (`DetectorErrors`), which mapping from pictures alone uses.
+    (`DetectorErrors`), which mapping from pictures alone uses. One that may be called in several threads at once has
+    `concurrent = True`.
 
     A custom detector is a class with this method and a constructor without arguments. Its name is `MODULE:CLASS`
     wherever a detector is expected: `parkenv survey --detector my_detectors:Mine`,
@@ -165,10 +166,7 @@ class GroundBand(NamedTuple):
 
 @runtime_checkable
 class BandDetector(Protocol):
-    """A detector that is faster if it knows where in the image the cars can be.
-
-    It is called in several threads at once.
-    """
+    """A detector that is faster if it knows where in the image the cars can be."""
 
     def detect_on_ground(self, image: Image, band: GroundBand) -> Detections: ...
 

@@ -80,6 +80,7 @@ class HogDetector:
     inside: float = 1.0
     margin: float = 0.25
 
+    concurrent: ClassVar[bool] = True
     errors: ClassVar[DetectorErrors] = DetectorErrors(
         0.2, 0.6, (0.0, -0.26, 0.0, 0.0), (0.08, 0.12, 0.08, 0.065)
     )

@@ -13,7 +13,7 @@ linear propagation, and the fused distance is the best linear unbiased estimate 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -69,6 +69,14 @@ _LENGTH_STD = 0.3  # m, standard deviation of how far a car's centre is behind i
 _MIDDLE = 0.05  # standard deviation between the middles of box and car, as a fraction of the box's width
 _UNKNOWN = 1e6  # m², variance of a measurement that the picture's border prevents
 _AGREE = 3.0  # standard deviations up to which measurements agree
+STREET_PITCH = math.radians(
+    0.7
+)  # of a camera against the ground at the kerb: a cross fall of 2.5 % 10 m away is 0.6
+_COMMON_PITCH = math.radians(
+    0.2
+)  # by how much the usual height and all boxes of a drive may be wrong together
+_SURE, _LEVEL_REACH = 0.5, 25.0  # probability and distance, m, of the cars that tell the pitch
+_OF_ONE_CAR = 0.2  # weight of a box: those of one car, about five, err alike
 _HIDDEN = 0.5  # fraction of a box's lower edge that nearer boxes cover, from which it is not the car's own
 
 
@@ -162,6 +170,35 @@ def distances_ahead(
     return variance * (weight * estimates).sum(axis=1), np.sqrt(variance), agree
 
 
+def street_pitch(seen: Sequence[tuple[Detections, GroundView]], errors: RangingErrors) -> tuple[float, float]:
+    """Return how much higher than its mount says a camera looks over the ground of parked cars, rad, and the error.
+
+    Streets fall towards their kerbs, and a load tilts the vehicle: in all pictures of a drive cars stand lower than on
+    a level plane. The heights of all its cars together tell by how much.
+    """
+    weights, sums = 0.0, 0.0
+    for detections, (camera, mount) in seen:
+        boxes, sure = errors.detector.corrected(detections.boxes), detections.probability >= _SURE
+        margin = MARGIN * np.array([camera.width, camera.height])
+        inside = (boxes[:, :2] > margin) & (boxes[:, 2:] < [camera.width, camera.height] - margin)
+        boxes = boxes[sure & inside.all(axis=1) & ~_is_hidden(boxes, sure)]
+        low, high = (mount.pitch - np.arctan((boxes[:, [3, 1]] - camera.cy) / camera.fy)).T
+        ahead = HEIGHT / (np.tan(high) - np.tan(low))
+        pitch = np.arctan(-mount.z / ahead) - low
+        edges = np.hypot(
+            (boxes[:, 3] - boxes[:, 1])[:, None] * [errors.detector.std[k] for k in (1, 3)], _EDGE
+        )
+        std = np.hypot(mount.z / ahead * HEIGHT_STD / HEIGHT, np.hypot(*edges.T) / camera.fy)
+        fits = (ahead < _LEVEL_REACH) & (np.abs(pitch) < _AGREE * np.hypot(std, STREET_PITCH))
+        weights += _OF_ONE_CAR * (std[fits] ** -2).sum()
+        sums += _OF_ONE_CAR * (pitch[fits] / std[fits] ** 2).sum()
+    if not weights:
+        return 0.0, STREET_PITCH
+    variance = 1.0 / weights + _COMMON_PITCH**2
+    left = 1.0 / (STREET_PITCH**-2 + 1.0 / variance)
+    return sums / weights * left / variance, math.sqrt(left)
+
+
 def localize_boxes(
     detections: Detections,
     ground: GroundView,
@@ -243,5 +280,5 @@ def _is_hidden(boxes: FloatArray, sure: BoolArray) -> BoolArray:
     common = np.minimum(boxes[:, None, 2], boxes[:, 2]) - np.maximum(boxes[:, None, 0], boxes[:, 0])
     lower = boxes[:, 3] > boxes[:, None, 3]
     above = boxes[:, 1] < boxes[:, None, 3]
-    hidden = np.where(lower & above & sure, common, 0.0).max(axis=1)
+    hidden = np.where(lower & above & sure, common, 0.0).max(axis=1, initial=0.0)
     return np.asarray(hidden > _HIDDEN * (boxes[:, 2] - boxes[:, 0]))

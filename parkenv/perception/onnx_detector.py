@@ -7,6 +7,7 @@ import math
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -51,14 +52,37 @@ _passed: dict[tuple[str, tuple[int, ...]], tuple[int, int]] = {}
 _COCO = {1: (0,), 80: (2, 5, 7)}  # cars by the number of classes: the only one, or COCO's car, bus and truck
 _BORDER = 114  # grey level around an image in the input
 _CENTER_NUMBERS = 9
-_STEP, _LONGEST = (
-    32,
-    4096,
-)  # px, of an input that follows the image: a side is a multiple of the one, at most the other
+# px, of an input that follows the image: a side is a multiple of the one, at most the other
+_STEP, _LONGEST = 32, 4096
 # A tensor whose numbers are in another file has an entry with the key `location`, its field 1, a text of 8 bytes; a
 # protobuf may write either number with more bytes than it needs.
 _ELSEWHERE = re.compile(rb"(?:\x0a|\x8a\x80*\x00)(?:\x08|\x88\x80*\x00)location")
 _INPUT = re.compile(_INPUT_PATTERN)
+
+
+class _QuietThread:
+    """OpenCV kept to the calling thread, and from writing; its settings return when the last of several calls ends."""
+
+    def __init__(self) -> None:
+        self._lock, self._calls, self._before = threading.Lock(), 0, (0, 0)
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._calls += 1
+            if self._calls == 1:
+                self._before = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
+                cv2.setNumThreads(1)
+                cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._calls -= 1
+            if not self._calls:
+                cv2.setNumThreads(self._before[0])
+                cv2.utils.logging.setLogLevel(self._before[1])
+
+
+_quiet_thread = _QuietThread()
 
 Pixels = Annotated[int, Field(ge=16, le=4096)]
 
@@ -162,12 +186,14 @@ class OnnxDetector:
         is_known: whether the file is known to be whole: it is not tried in a process of its own.
     """
 
+    concurrent = True
+
     def __init__(
         self, data: bytes, name: str, settings: OnnxSettings | None = None, *, is_known: bool = False
     ) -> None:
         self.settings = settings or OnnxSettings()
         self._data, self._name = data, name
-        self._net: Any = None
+        self._of_thread = threading.local()  # OpenCV's network keeps the numbers of its last run
         if _ELSEWHERE.search(data):
             raise InputError(f"{name}: keeps its weights in other files; export it as a single file")
         width, height = self.settings.size or (0, 0)
@@ -180,8 +206,7 @@ class OnnxDetector:
             {key: one.shape for key, one in self._run_all(empty).items()}
         )
         # OpenCV runs a network with an input of another shape, and tells of its own in a description alone.
-        net: Any = self._net
-        fixed = _INPUT.search(net.dump())
+        fixed = _INPUT.search(self._of_thread.net.dump())
         if fixed and fixed[1] != " x ".join(map(str, empty.shape)):
             raise InputError(
                 f"{name}: its input is {fixed[1]}, and size and channels in {sidecar_of(name)} (or their defaults) are "
@@ -202,7 +227,10 @@ class OnnxDetector:
         return cls(data, str(path), settings, is_known=is_known)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_net": None}  # read again where it is needed
+        return {key: value for key, value in self.__dict__.items() if key != "_of_thread"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _of_thread=threading.local())
 
     def detect(self, image: Image) -> Detections:
         decoded = self._look(image)
@@ -248,24 +276,20 @@ class OnnxDetector:
         return self._run_all(fed)[self._output]
 
     def _run_all(self, fed: Float32Array) -> dict[str, Float32Array]:
-        threads, level = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
-        cv2.setNumThreads(1)
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        own = self._of_thread
         try:
-            if self._net is None:
-                self._net = cv2.dnn.readNetFromONNX(np.frombuffer(self._data, np.uint8))
-            names = list(self._net.getUnconnectedOutLayersNames())
-            self._net.setInput(fed)
-            # OpenCV 5 computes all outputs or none.
-            outputs = [np.array(output, dtype=np.float32) for output in self._net.forward(names)]
+            with _quiet_thread:
+                if not hasattr(own, "net"):
+                    own.net = cv2.dnn.readNetFromONNX(np.frombuffer(self._data, np.uint8))
+                names = list(own.net.getUnconnectedOutLayersNames())
+                own.net.setInput(fed)
+                # OpenCV 5 computes all outputs or none.
+                outputs = [np.array(output, dtype=np.float32) for output in own.net.forward(names)]
         except cv2.error as error:
             reason = " ".join(str(error).split())
             raise InputError(
                 f"{self._name}: OpenCV cannot run this network with an input of shape {fed.shape}: {reason:.300}"
             ) from error
-        finally:
-            cv2.setNumThreads(threads)
-            cv2.utils.logging.setLogLevel(level)
         return dict(zip(names, outputs, strict=True))
 
     def _fits(self, layout: str, shape: Sequence[int]) -> bool:

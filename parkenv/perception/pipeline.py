@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.compiled.threads import in_threads
+from parkenv.compiled.threads import ahead_in_threads, in_threads
 from parkenv.errors import InputError
 from parkenv.perception.detector import (
     PROBABILITY,
@@ -22,7 +23,7 @@ from parkenv.perception.detector import (
 )
 from parkenv.perception.detector_registry import make_detector
 from parkenv.perception.ground_detector import ground_band
-from parkenv.perception.monocular import GroundView, RangingErrors, localize_boxes
+from parkenv.perception.monocular import GroundView, RangingErrors, localize_boxes, street_pitch
 from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
 from parkenv.perception.ranging import (
     LocatedCars,
@@ -49,7 +50,7 @@ class CameraView:
         stereo: without a laser, the stereo camera and its disparity, (h, w) float32 px; else None.
         cars: the detections that could be located.
         slots: (n,) int64, the slot that each of `cars` stands in; -1 for none.
-        hiding: without a ranging sensor, (k, 4) px, all boxes, however unlikely, behind which slots are not seen.
+        hiding: without a ranging sensor, (k, 4) px, all boxes behind which slots are not seen.
     """
 
     name: str
@@ -64,7 +65,9 @@ class CameraView:
     hiding: FloatArray | None = None
 
 
-class _Seen(NamedTuple):
+class Seen(NamedTuple):
+    """What the pictures of a capture show, wherever the vehicle is."""
+
     detections: dict[str, Detections]  # by camera
     disparities: dict[str, tuple[StereoCamera, NDArray[np.float32]]]  # by stereo camera, eq. 3.1
 
@@ -114,8 +117,9 @@ class PerceptionPipeline:
         self.detector = make_detector(detector)
         own = getattr(self.detector, "errors", DetectorErrors())
         self.errors = (errors or RangingErrors())._replace(detector=own.on_streets if on_streets else own)
-        # Only these promise that they may be called in several threads.
-        self._concurrent = isinstance(self.detector, BandDetector)
+        # On streets much resembles a car a little: hedges, walls, cars behind others.
+        self._hides_from = PROBABILITY if on_streets else 0.0
+        self._concurrent = getattr(self.detector, "concurrent", False)
 
     def process(
         self,
@@ -138,17 +142,13 @@ class PerceptionPipeline:
         captured: TimedCapture,
         vehicle: FloatArray | Callable[[Sequence[RangeScan]], FloatArray] | None = None,
         headings_near: Callable[[FloatArray], FloatArray] | None = None,
+        seen: Seen | None = None,
     ) -> PerceptionResult:
-        """Find and locate the cars of one capture, without slots; see `process` and `localize_boxes`."""
-        return self._locate(captured, self._look(captured), vehicle, headings_near)
+        """Find and locate the cars of one capture, without slots; see `process` and `localize_boxes`.
 
-    def _locate(
-        self,
-        captured: TimedCapture,
-        seen: _Seen,
-        vehicle: FloatArray | Callable[[Sequence[RangeScan]], FloatArray] | None,
-        headings_near: Callable[[FloatArray], FloatArray] | None,
-    ) -> PerceptionResult:
+        What a capture has `seen` already is not looked for again.
+        """
+        seen = seen or self.look(captured)
         vehicle = captured.capture.pose if vehicle is None else vehicle
         views = []
         at = np.zeros(3) if callable(vehicle) else vehicle
@@ -168,7 +168,8 @@ class PerceptionPipeline:
                 x, y, _ = mount.in_world(vehicle)
                 scan, ground = RangeScan(x, y, np.empty(0), np.empty(0), 0.0), GroundView(camera, mount)
                 cars = localize_boxes(detections, ground, vehicle, self.errors, headings_near)
-                hiding = self.errors.detector.corrected(detections.boxes)
+                hides = detections.probability >= self._hides_from
+                hiding = self.errors.detector.corrected(detections.boxes[hides])
             confirmed = detections.probability >= PROBABILITY
             confirmed[cars.detection] = True
             cars = dataclasses.replace(cars, detection=np.cumsum(confirmed)[cars.detection] - 1)
@@ -204,19 +205,44 @@ class PerceptionPipeline:
         if self.lot is None:
             raise InputError("the pipeline has no lot, want one with the slots to observe")
         slots = SlotFilter(self.lot)
-        seen = in_threads(self._look, captures) if self._concurrent else map(self._look, captures)
+        every = in_threads(self.look, captures) if self._concurrent else map(self.look, captures)
         results = tuple(
-            self.update_slots(slots, self._locate(*pair, None, slots.headings_near))
-            for pair in zip(captures, seen, strict=True)
+            self.update_slots(slots, self.locate(captured, None, slots.headings_near, seen))
+            for captured, seen in zip(captures, every, strict=True)
         )
         return results, slots.observation()
 
-    def _look(self, captured: TimedCapture) -> _Seen:
+    def look_ahead(self, captures: Iterable[TimedCapture]) -> Iterator[tuple[TimedCapture, Seen]]:
+        """Yield captures and what they have seen, in order; the next ones are looked at in threads meanwhile."""
+        return (
+            ahead_in_threads(self.look, captures)
+            if self._concurrent
+            else ((c, self.look(c)) for c in captures)
+        )
+
+    def levelled(self, looked: Sequence[tuple[TimedCapture, Seen]]) -> PerceptionPipeline:
+        """Return the pipeline with the pitch of its cameras that the cars of a drive tell; see `street_pitch`."""
+        cameras, left = [], [0.0]
+        for name, camera, mount in self.rig.cameras:
+            views = [
+                (seen.detections[name], GroundView(camera, mount.tilted(*captured.capture.tilt)))
+                for captured, seen in looked
+            ]
+            pitch, error = street_pitch(views, self.errors)
+            cameras.append((name, camera, dataclasses.replace(mount, pitch=mount.pitch + pitch)))
+            left.append(error)
+        pipeline = copy.copy(self)
+        pipeline.rig = dataclasses.replace(self.rig, cameras=tuple(cameras))
+        pipeline.errors = self.errors._replace(pitch=max(left))
+        return pipeline
+
+    def look(self, captured: TimedCapture) -> Seen:
+        """Find the cars in the pictures of a capture, and the disparities of its stereo pairs."""
         capture = captured.capture
         if self._concurrent and self.rig.stereo_cameras:
             of: list[Callable[[Capture], Any]] = [self._detections, self._disparities]
-            return _Seen(*in_threads(lambda part: part(capture), of))
-        return _Seen(self._detections(capture), self._disparities(capture))
+            return Seen(*in_threads(lambda part: part(capture), of))
+        return Seen(self._detections(capture), self._disparities(capture))
 
     def _detections(self, capture: Capture) -> dict[str, Detections]:
         return {

@@ -32,6 +32,8 @@ WHOLE_END = 1.2  # m; a visible edge of this length is the front or rear of a ca
 OFF_GROUND = 0.7  # m; tolerance of the height of a box's lower edge above or below the ground
 CAR_HEIGHT = (0.8, 3.2)  # m; range of the height of a box's upper edge
 _LEAST_BEAMS = 3
+# Least height of what beams meet, as a fraction of its box's, and how much higher it may be, m.
+_TOPS = 0.45, 0.6
 MARGIN = 0.02  # of a picture's size; boxes that come this close to its border count as clipped by it
 _EXPLAINED = 0.5  # fraction of a box's beams from which they belong to the nearer car of another box
 
@@ -159,9 +161,10 @@ def localize_cars(
     """Locate the detected cars: fit a car's rectangle to the `car_beams` of each box.
 
     The following detections are dropped: those without an obstacle at bumper height; those that, at its distance, would
-    not be on the ground or have a car's height; those whose beams end on the nearer car of another box, which hides
-    them, or is the same; and cars too hidden to estimate their orientation, with neither a side nor an end visible, or
-    only a part of one at the image border. Later captures show them better.
+    not be on the ground, or not have a car's height or the obstacle's, where a point cloud tells it; those whose beams
+    end on the nearer car of another box, which hides them, or is the same; and cars too hidden to estimate their
+    orientation, with neither a side nor an end visible, or only a part of one at the image border. Later captures show
+    them better.
     """
     scan = scan.seen_from(*mount.in_world(vehicle)[:2])
     rows, cars, distances, points = [], [], [], []
@@ -178,7 +181,11 @@ def localize_cars(
         beams, cut = car_beams(scan, beams_between(scan, left, right), clipped)
         if not len(beams) or explained[beams].mean() >= _EXPLAINED:
             continue
-        if not _is_on_ground(detections.boxes[i], float(np.median(scan.distance[beams])), camera, mount):
+        low, high = _heights(detections.boxes[i], float(np.median(scan.distance[beams])), camera, mount)
+        at_margin = detections.boxes[i, 3] >= (1.0 - MARGIN) * camera.height
+        if not (at_margin or abs(low) <= OFF_GROUND) or not CAR_HEIGHT[0] <= high <= CAR_HEIGHT[1]:
+            continue
+        if scan.tops is not None and not _is_as_high(scan.tops[beams], high):
             continue
         ends = scan.points(beams)
         car = fit_box(ends, np.array([scan.x, scan.y]), end_on=bool(detections.end_on[i]), cut=cut)
@@ -245,7 +252,8 @@ def _cars_behind(
     )
 
 
-def _is_on_ground(box: Float32Array, distance: float, camera: PinholeCamera, mount: Mount) -> bool:
+def _heights(box: Float32Array, distance: float, camera: PinholeCamera, mount: Mount) -> tuple[float, float]:
+    """Return the heights above the ground of a box's lower and upper edge, m, at a distance."""
     left, top, right, bottom = box.tolist()
     aside = math.atan((0.5 * (left + right) - camera.cx) / camera.fx)
     depth = distance * math.cos(aside)
@@ -253,8 +261,13 @@ def _is_on_ground(box: Float32Array, distance: float, camera: PinholeCamera, mou
         mount.z + depth * math.tan(mount.pitch - math.atan((row - camera.cy) / camera.fy))
         for row in (bottom, top)
     )
-    at_margin = bottom >= (1.0 - MARGIN) * camera.height
-    return (at_margin or abs(low) <= OFF_GROUND) and CAR_HEIGHT[0] <= high <= CAR_HEIGHT[1]
+    return low, high
+
+
+def _is_as_high(tops: FloatArray, high: float) -> bool:
+    """Return whether what beams meet may be as high as a box: no house behind it, and no step before it."""
+    known = tops[np.isfinite(tops)]
+    return not len(known) or _TOPS[0] * high <= float(np.percentile(known, 90.0)) <= high + _TOPS[1]
 
 
 def _hidden(distance: FloatArray) -> bool:

@@ -16,16 +16,15 @@ from parkenv.files.known_names import SCENARIO_NAMES, LocaliserName
 from parkenv.lots.formats.geojson import read_contents
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import lot_format
-from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.drive_folders import source_of
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.map_files import week_time, write_grid, write_slots
-from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.recorded_drive import CAR_COLUMNS, MappedDrive, RecordedDrive, map_drive
+from parkenv.mapping.recordings.calibration import DriveCalibration
+from parkenv.mapping.recordings.folders import source_of
+from parkenv.mapping.recordings.located_drive import CAR_COLUMNS, MappedDrive, locate_cars, map_drive
+from parkenv.mapping.recordings.photo_options import PhotoOptions
+from parkenv.mapping.recordings.recorded_drive import RecordedDrive
 from parkenv.mapping.store import MapStore
-from parkenv.mapping.survey import SessionMap
 from parkenv.perception.detector_registry import make_detector
-from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.scenarios.build import make_scenario
 from parkenv.show.figures.survey import save_map
 from parkenv.studies.results import Row
@@ -71,18 +70,15 @@ def add_recording(
     make_folder(folder)
     with MapStore(folder / MAP_FILE, scenario.lot) as store:
         require(not store.has(drive.key), f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
-        pipeline = PerceptionPipeline(
-            drive.rig, scenario.lot, finder, drive.errors, on_streets=drive.head is None
-        )
-        mapped = SessionMap(pipeline, scenario.lot, localise)
-        results = ((mapped.add(*one), one[1]) for one in drive.captures(every))
-        found = map_drive(drive, scenario.lot, mapped, results, counted(progress, "Mapping"))
+        on_frame = counted(progress, "Locating cars")
+        located = locate_cars(drive, finder, scenario.lot, every=every, localise=localise, on_frame=on_frame)
+        found = map_drive(located, scenario.lot)
         store.add(found.session)
         log = store.log()
     title = f"{scenario.name}, {week_time(found.session.time)}"
     save_map(scenario.lot, predict(log, found.session.time), None, title, folder / "slots.png")
     write_drives(folder, scenario.lot, log, frame, [found])
-    return drive_row(drive, found)
+    return drive_row(found)
 
 
 def write_drives(
@@ -135,14 +131,15 @@ def _scenario_of(drive: RecordedDrive) -> Scenario:
     return make_scenario(name)
 
 
-def drive_row(drive: RecordedDrive, found: MappedDrive) -> Row:
+def drive_row(found: MappedDrive) -> Row:
     """Return what a drive has found, for tables."""
+    located, drive = found.located, found.located.drive
     states, std = found.states, [car["distance_std_m"] for car in found.sightings if "distance_std_m" in car]
     return {
         "recording": str(drive.path),
         "key": drive.key,
         "begins": week_time(found.session.time),
-        "captures": found.frames,
+        "captures": len(located.results),
         "pictures_without_pose": drive.without_pose,
         **({"pictures_without_partner": partly} if (partly := drive.without_partner) else {}),
         "slots": len(states.in_view),
@@ -151,7 +148,7 @@ def drive_row(drive: RecordedDrive, found: MappedDrive) -> Row:
         "cars_sighted": len(found.session.cars),
         "sighted_in_slots": sum(car["slot"] != "" for car in found.sightings),
         "cars": len(found.cars),
-        "corrected_m": round(found.corrected_m, 3),
+        "corrected_m": round(located.corrected_m, 3),
         **({"pose_error_m": round(drive.errors.position, 3)} if drive.errors else {}),
         **({"distance_std_m": round(float(np.median(std)), 3)} if std else {}),
     }

@@ -22,22 +22,14 @@ from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import read_lot
-from parkenv.mapping.car_tracks import CarTracks, ParkedCars
-from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.photo_options import PhotoOptions
-from parkenv.mapping.recorded_drive import (
-    MappedDrive,
-    RecordedDrive,
-    map_drive,
-)
-from parkenv.mapping.scan_matching import make_locate
+from parkenv.mapping.car_tracks import ParkedCars
+from parkenv.mapping.recordings.calibration import DriveCalibration
+from parkenv.mapping.recordings.located_drive import LocatedDrive, MappedDrive, locate_cars, map_drive
+from parkenv.mapping.recordings.photo_options import PhotoOptions
 from parkenv.mapping.store import MapStore, Session
 from parkenv.mapping.street_lanes import driven_lanes, mapped_lanes, street_lot
 from parkenv.mapping.street_slots import CAR, GAP, LONE_CAR, ONCE, StreetSlots, discover_street
-from parkenv.mapping.survey import SessionMap
-from parkenv.perception.detector import Detector
 from parkenv.perception.detector_registry import make_detector
-from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
 from parkenv.perception.slot_filter import SlotFilter
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.recorded_session import drive_row, read_drive, write_drives
@@ -48,26 +40,6 @@ from parkenv.world.lot import Lane, ParkingLot
 LOT_FILE = "lot.geojson"
 _SAME_M = 1.5  # m, within which a slot of an earlier map is the same
 _FREE = 0.3  # P(taken) below which scans show a place to be free
-
-
-@dataclass(frozen=True, eq=False)
-class _Located:
-    """A drive with what was located in each capture."""
-
-    drive: RecordedDrive
-    pipeline: PerceptionPipeline
-    results: list[tuple[PerceptionResult, FloatArray]]  # and the recorded pose
-
-    @property
-    def track(self) -> FloatArray:
-        return np.array([result.vehicle[:2] for result, _ in self.results])
-
-    def cars(self) -> ParkedCars:
-        tracks = CarTracks()
-        for result, _ in self.results:
-            for view in result.views:
-                tracks.add(result.captured.time, view)
-        return tracks.cars(self.track)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,59 +81,35 @@ def discover_recordings(
     progress("Reading", 0, 0)
     earlier = _read_earlier(folder) if (folder / LOT_FILE).exists() else _Earlier()
     frame = earlier.frame
-    drives: list[_Located] = []
+    drives: list[LocatedDrive] = []
     for recording in recordings:
         drive = read_drive(recording, calibration, photos, frame, localise)
         frame = frame or drive.frame
         known = {one.drive.key for one in drives} | {one.key for one in earlier.sessions}
         require(drive.key not in known, f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
-        drives.append(_located(drive, finder, every, localise, progress))
+        on_frame = counted(progress, "Locating cars")
+        drives.append(locate_cars(drive, finder, every=every, localise=localise, on_frame=on_frame))
     tracks = [*earlier.tracks, *(one.track for one in drives)]
     if streets is not None and frame is None:
         raise InputError(f"{streets}: is in degrees, and the poses are in metres; want poses in degrees")
     lanes = driven_lanes(tracks) if streets is None or frame is None else mapped_lanes(streets, frame, tracks)
-    cars = [*earlier.cars, *(one.cars() for one in drives)]
+    cars = [*earlier.cars, *(one.parked for one in drives)]
     found = discover_street(cars, tracks, lambda slots: _shown_free(slots, lanes, drives))
     lot, found = street_lot(folder.absolute().name, found, lanes, fit=streets is None)
     lot, sessions = _continued(lot, earlier)
-    mapped = [_mapped(one, lot) for one in drives]
+    mapped = [map_drive(one, lot) for one in drives]
     sessions += [one.session for one in mapped]
     make_folder(folder)
     with write_together(folder) as beside:
         _write(beside, lot, found, frame, tracks, sessions, mapped, recordings, streets)
     return [
-        drive_row(one.drive, of_drive) | {"from_cars": int((found.source != GAP).sum()),
-                                          "guessed": int((found.source != CAR).sum())}
-        for one, of_drive in zip(drives, mapped, strict=True)
-    ]  # fmt: skip
+        drive_row(one)
+        | {"from_cars": int((found.source != GAP).sum()), "guessed": int((found.source != CAR).sum())}
+        for one in mapped
+    ]
 
 
-def _located(
-    drive: RecordedDrive, detector: Detector, every: float, localise: str, progress: Progress
-) -> _Located:
-    """Locate the cars in each capture; results are without pictures, so that those of a whole drive can be kept."""
-    pipeline = PerceptionPipeline(drive.rig, None, detector, drive.errors, on_streets=drive.head is None)
-    locate, results = make_locate(localise, None), []
-    on_frame = counted(progress, "Locating cars")
-    for captured, recorded in drive.captures(every):
-        result = pipeline.locate(captured, locate(recorded))
-        captured = captured._replace(capture=replace(captured.capture, images={}, pairs={}))
-        views = tuple(replace(v, image=np.empty((0, 0, 3), np.uint8), stereo=None) for v in result.views)
-        results.append((replace(result, captured=captured, views=views), recorded))
-        on_frame()
-    return _Located(drive, pipeline, results)
-
-
-def _mapped(located: _Located, lot: ParkingLot) -> MappedDrive:
-    mapped = SessionMap(located.pipeline, lot, "none")
-    results = (
-        (mapped.record(located.pipeline.update_slots(mapped.slots, result)), recorded)
-        for result, recorded in located.results
-    )
-    return map_drive(located.drive, lot, mapped, results)
-
-
-def _shown_free(slots: Slots, lanes: Sequence[Lane], drives: Sequence[_Located]) -> np.ndarray[Any, Any]:
+def _shown_free(slots: Slots, lanes: Sequence[Lane], drives: Sequence[LocatedDrive]) -> np.ndarray[Any, Any]:
     """Return whether the scans of the drives pass over slots, (n,) bool."""
     n = len(slots)
     of_gaps = StreetSlots(slots, np.full(n, CAR), np.zeros(n, np.int64), np.full(n, np.nan))
@@ -171,8 +119,8 @@ def _shown_free(slots: Slots, lanes: Sequence[Lane], drives: Sequence[_Located])
         return np.zeros(n, np.bool_)
     shown = SlotFilter(lot)
     for one in drives:
-        for result, _ in one.results:
-            one.pipeline.update_slots(shown, result)
+        for _ in one.update(shown):
+            pass
     states = shown.states()
     free = lot.slot_xy[states.in_view & (states.p_occupied < _FREE)]
     return np.asarray((slots.xy[:, None] == free[None]).all(axis=2).any(axis=1))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming
 from parkenv.files.spec_file import Several, Spec
-from parkenv.mapping.lenses import Picture, Placed
+from parkenv.mapping.recordings.lenses import Picture, Placed
 from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.rig import Mount
 

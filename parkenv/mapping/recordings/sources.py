@@ -20,9 +20,9 @@ from parkenv.files.images import SUFFIXES, files_in
 from parkenv.files.limited_reading import read_arrays, read_bytes, read_text
 from parkenv.files.recordings import CLOUD, COMPRESSED_IMAGE, Messages
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.drive_poses import FrameTree
-from parkenv.mapping.lenses import Info
+from parkenv.mapping.recordings.calibration import DriveCalibration
+from parkenv.mapping.recordings.lenses import Info
+from parkenv.mapping.recordings.poses import FrameTree
 from parkenv.perception.monocular import RangingErrors
 
 CLOUD_SUFFIXES = (".npz", ".bin", ".txt")

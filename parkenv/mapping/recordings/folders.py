@@ -20,10 +20,10 @@ from parkenv.files.recordings import COMPRESSED_IMAGE, IMAGE, SCAN, open_recordi
 from parkenv.files.tracks import Track, read_track, stamp_in
 from parkenv.files.videos import VIDEO_SUFFIXES, Video
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, MountSpec
-from parkenv.mapping.drive_sources import PictureFile, Source, Stream, number_of, opened, stream_of
-from parkenv.mapping.kitti_folders import kitti_folder
-from parkenv.mapping.photo_options import PhotoOptions
+from parkenv.mapping.recordings.calibration import CameraSpec, DriveCalibration, MountSpec
+from parkenv.mapping.recordings.kitti import kitti_folder
+from parkenv.mapping.recordings.photo_options import PhotoOptions
+from parkenv.mapping.recordings.sources import PictureFile, Source, Stream, number_of, opened, stream_of
 from parkenv.perception.monocular import RangingErrors
 from sim_sensors.camera.models import PinholeCamera
 

@@ -14,10 +14,10 @@ from parkenv.errors import InputError
 from parkenv.files.images import files_in, read_image
 from parkenv.files.limited_reading import read_text
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.mapping.drive_poses import FrameTree, angles_of
-from parkenv.mapping.drive_sources import Source, Stream, opened, stream_of
-from parkenv.mapping.drive_writer import RECORDED_MONDAY_S
-from parkenv.mapping.lenses import OPTICAL, Info
+from parkenv.mapping.recordings.lenses import OPTICAL, Info
+from parkenv.mapping.recordings.poses import FrameTree, angles_of
+from parkenv.mapping.recordings.sources import Source, Stream, opened, stream_of
+from parkenv.mapping.recordings.writer import RECORDED_MONDAY_S
 from parkenv.perception.monocular import RangingErrors
 
 IMU_HEIGHT_M, CAMERA_HEIGHT_M = 0.93, 1.65  # above the road

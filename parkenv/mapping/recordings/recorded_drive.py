@@ -10,7 +10,7 @@ left out. Times are those of the messages' headers, of messages without header t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,20 +25,21 @@ from parkenv.errors import InputError, naming
 from parkenv.files.limited_reading import parse_json
 from parkenv.files.recordings import TRANSFORMS, Messages, open_recording, picture_in, stamp_of
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.mapping.car_tracks import CarTracks, ParkedCars
-from parkenv.mapping.drive_calibration import DriveCalibration
-from parkenv.mapping.drive_poses import PoseReader, PoseTrack, placed, within
-from parkenv.mapping.drive_setup import set_up, set_up_survey
-from parkenv.mapping.drive_sources import Source
-from parkenv.mapping.drive_writer import HEAD, RECORDED_MONDAY_S, Head
-from parkenv.mapping.grid import OccupancyGrid
-from parkenv.mapping.laser_scans import Scan, common_scanner, mirrored, scan_of, without_motion
-from parkenv.mapping.point_clouds import SCANNER, CloudScan, Road, fit_road, points_of, scan_of_cloud
-from parkenv.mapping.store import Session
-from parkenv.mapping.survey import SessionMap
+from parkenv.mapping.recordings.calibration import DriveCalibration
+from parkenv.mapping.recordings.laser_scans import Scan, common_scanner, mirrored, scan_of, without_motion
+from parkenv.mapping.recordings.point_clouds import (
+    SCANNER,
+    CloudScan,
+    Road,
+    fit_road,
+    points_of,
+    scan_of_cloud,
+)
+from parkenv.mapping.recordings.poses import PoseReader, PoseTrack, placed, within
+from parkenv.mapping.recordings.setup import set_up, set_up_survey
+from parkenv.mapping.recordings.sources import Source
+from parkenv.mapping.recordings.writer import HEAD, RECORDED_MONDAY_S, Head
 from parkenv.perception.monocular import RangingErrors
-from parkenv.perception.pipeline import CameraView, PerceptionResult
-from parkenv.perception.slot_filter import SlotFilter, SlotStates
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import DAY_S
 from sim_sensors.camera.models import Frame, StereoFrame
@@ -46,24 +47,9 @@ from sim_sensors.rig import Capture, SensorRig, TimedCapture
 
 PAIR_S, CAMERAS_S, LASER_S = 0.001, 0.1, 0.5
 """Longest times between a picture and what joins it, s: the right picture of a pair, another camera, a laser."""
-CAR_COLUMNS = (
-    "time_s", "x_m", "y_m", "yaw_rad", "length_m", "width_m", "position_std_m", "probability", "sightings",
-    "distance_m", "slot",
-)  # fmt: skip
 FAR_M = 500.0  # farther from the lot are poses of another frame
 _STILL = 1e-3, 1e-4  # m and rad in a scan, below which nothing is to correct
 _NO_DEPTH, _NO_IDS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
-
-
-@dataclass(frozen=True, eq=False)
-class MappedDrive:
-    session: Session  # the record for the map file
-    states: SlotStates  # the filter's final estimate
-    grid: OccupancyGrid  # the occupancy grid
-    frames: int  # captures that were used
-    corrected_m: float  # m, greatest distance between a recorded pose and what it was corrected to
-    cars: list[dict[str, Any]]  # of each: place, size, errors and slot
-    sightings: list[dict[str, Any]]  # of each car located in a picture: the same, and the time
 
 
 class _Matched(NamedTuple):
@@ -354,56 +340,6 @@ class RecordedDrive:
                 f"{self.path}: its poses, such as {x:.0f}, {y:.0f}, are {away:,.0f} m away from the lot; want them "
                 "in its frame: `origin` in the calibration, or --origin LAT,LON of its x = y = 0 for poses in degrees"
             )
-
-
-def map_drive(
-    drive: RecordedDrive,
-    lot: ParkingLot,
-    mapped: SessionMap,
-    results: Iterable[tuple[PerceptionResult, FloatArray]],
-    on_frame: Callable[[], None] = lambda: None,
-) -> MappedDrive:
-    """Return what a session mapped, from the result of each capture and its recorded pose."""
-    shifts, tracks = [], CarTracks()
-    sightings: list[dict[str, Any]] = []
-    for result, recorded in results:
-        shifts.append(np.hypot(*(result.vehicle - recorded)[:2]))
-        for view in result.views:
-            tracks.add(result.captured.time, view)
-            sightings += _sightings(result.captured.time, view, lot)
-        on_frame()
-    rig, weather = (drive.head.rig, drive.head.weather) if drive.head else ("recorded", "unknown")
-    session = mapped.session(drive.key, drive.start, rig, weather)
-    parked = tracks.cars(drive.poses[:, :2])
-    return MappedDrive(
-        session, mapped.slots.states(), mapped.grid, len(shifts), float(max(shifts, default=0.0)),
-        list(_rows_of(parked, lot, mapped.slots)), sightings,
-    )  # fmt: skip
-
-
-def _rows_of(parked: ParkedCars, lot: ParkingLot, slots: SlotFilter) -> Iterator[dict[str, Any]]:
-    numbers = (
-        parked.time, parked.xy, parked.yaw, parked.size, parked.std, parked.probability, parked.sightings,
-        parked.distance,
-    )  # fmt: skip
-    of_slots = slots.slots_of(parked.located).tolist()
-    for row, slot in zip(np.column_stack(numbers).tolist(), of_slots, strict=True):
-        place = [*(round(value, 3) for value in row), lot.slot_ids[slot] if slot >= 0 else ""]
-        found: dict[str, Any] = dict(zip(CAR_COLUMNS, place, strict=True))
-        yield found | {"sightings": int(found["sightings"])}
-
-
-def _sightings(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[str, Any]]:
-    cars = view.cars
-    for k, (x, y, yaw) in enumerate(cars.poses.tolist()):
-        place = {"time_s": time, "camera": view.name, "x_m": x, "y_m": y, "yaw_rad": yaw}
-        slot = int(view.slots[k])
-        place |= {"probability": float(cars.probability[k]), "distance_m": float(cars.distance[k])}
-        place |= {"slot": lot.slot_ids[slot] if slot >= 0 else ""}
-        if cars.distance_std is not None and cars.covariance is not None:
-            spread = math.sqrt(np.trace(cars.covariance[k]) / 2.0)
-            place |= {"distance_std_m": float(cars.distance_std[k]), "position_std_m": spread}
-        yield {name: round(value, 3) if isinstance(value, float) else value for name, value in place.items()}
 
 
 def _nearest(stamps: IntArray, at: IntArray) -> IntArray:

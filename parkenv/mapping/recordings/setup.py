@@ -28,12 +28,18 @@ from parkenv.files.recordings import (
     Messages,
     open_recording,
 )
-from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, LaserSpec, SizedLens, StereoSpec
-from parkenv.mapping.drive_poses import FrameTree
-from parkenv.mapping.drive_sources import Source
-from parkenv.mapping.drive_writer import topics_of
-from parkenv.mapping.lenses import Info, Picture, Placed, aligned_pair, camera_axes
-from parkenv.mapping.point_clouds import BAND_MIDDLE_M, fit_road, points_of
+from parkenv.mapping.recordings.calibration import (
+    CameraSpec,
+    DriveCalibration,
+    LaserSpec,
+    SizedLens,
+    StereoSpec,
+)
+from parkenv.mapping.recordings.lenses import Info, Picture, Placed, aligned_pair, camera_axes
+from parkenv.mapping.recordings.point_clouds import BAND_MIDDLE_M, fit_road, points_of
+from parkenv.mapping.recordings.poses import FrameTree
+from parkenv.mapping.recordings.sources import Source
+from parkenv.mapping.recordings.writer import topics_of
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.scanner import LaserScanner
