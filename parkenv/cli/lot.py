@@ -48,6 +48,7 @@ _LOT_COLUMNS = (
     Column("result", "result"),
     Column("reason", "reason"),
 )
+_LEFT_OUT = (Column("reason", "reason"), Column("bays", "bays", digits=0), Column("ids", "ids"))
 _MOST_UNREAD = 20  # most rows of what could not be read that are printed
 AUTO = "auto"  # value of `--entry` and `--goal` that allows a guess
 LotName = Annotated[
@@ -148,6 +149,12 @@ def _point(text: str) -> str:
     return text
 
 
+def _pairs(text: str) -> dict[str, str]:
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    require(all(part and name for part, _, name in pairs), f"is {text!r:.80}, want PART=COLUMN,...")
+    return {part.strip(): name for part, _, name in pairs}
+
+
 def _square(text: str) -> tuple[float, ...]:
     from parkenv.lots.local_frame import LocalFrame
 
@@ -172,6 +179,8 @@ class Import(Command):
     With --town, a whole town becomes one lot: streets, kerbs, car parks and garages with prices and rules, entries at
     its edge, and goals with weights of demand. A table of its facilities (.csv) gives name, kind, capacity, and the
     source of the capacity: the map (tag, drawn) or a rule.
+    With --bays, the bays of a city's register become slots at the kerbs of the map's streets: points (meters), outlines, or
+    kerb lines with counts, with their ids and rules. With --town, car parks of the map are imported, too.
 
     If something is missing, the picture is still drawn, but no lot is written and the exit code is 2.
     """
@@ -183,6 +192,7 @@ class Import(Command):
         parkenv lot import town.geojson --split --out lots
         parkenv lot import town.osm.pbf --town --out town.geojson --picture town.png
         parkenv lot import map.osm --town --around 49.5,11.3,800 --out part.geojson
+        parkenv lot import streets.osm.pbf --bays meters.csv --columns bay=SpaceID,limit=TimeLimit --out kerbs.geojson
         """
 
     place: Place
@@ -222,6 +232,21 @@ class Import(Command):
         False, "Find the car parks of a town and write a lot of each; entries and goals are guessed."
     )
     town: bool = option(False, "Import a whole town as one lot; entries and goals are those of the map.")
+    bays: Path | None = option(
+        None,
+        "Register of bays at the kerb (.csv, .geojson, also .gz): the only kerb parking of the lot. What does not fit is "
+        "left out, and listed in a table beside the lot.",
+        takes="REGISTER",
+        default="none",
+    )
+    columns: dict[str, str] = option(
+        {},
+        "Columns of the register, by part: bay (its id), lat, lon, line, street, capacity, cars, limit, rate, hours, "
+        "class, ... Several that are added up are joined by +.",
+        takes="PART=COLUMN,...",
+        parse=_pairs,
+        default="by usual names",
+    )
     car_parks: Path | None = option(
         None,
         "List of counted car parks: name,capacity,lat,lon. With --town, they override names and "
@@ -256,13 +281,19 @@ class Import(Command):
             "--left-hand",
         )
         require_together(self.town or self.car_parks is None, "--car-parks wants --town")
+        require_together(self.bays or not self.columns, "--columns wants --bays")
+        require_together(not (self.split and self.bays), "--split and --bays: want one of them")
         require_together(self.car_parks or not self.listed_only, "--listed-only wants --car-parks")
         require_together(
-            not (self.town and (self.entry or self.goal)),
-            "--town has those of the map, want no --entry, --goal",
+            not (self._is_town and (self.entry or self.goal)),
+            "--town and --bays have those of the map, want no --entry, --goal",
         )
-        require_together(on_earth or not self.town, "--bounds: want SOUTH,WEST,NORTH,EAST with --town")
+        require_together(on_earth or not self._is_town, "--bounds: want SOUTH,WEST,NORTH,EAST with --town")
         return self
+
+    @property
+    def _is_town(self) -> bool:
+        return self.town or self.bays is not None
 
     @property
     def box(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
@@ -298,25 +329,28 @@ class Import(Command):
 
         check_lot_output(self.out)
         table, unread_csv, town = self.out.with_suffix(".csv"), self.out.with_suffix(".unread.csv"), None
+        left_out_csv = self.out.with_suffix(".left_out.csv")
         require(
             self.picture is None or self.picture.suffix.lower() == ".png",
             f"--picture {self.picture}: want a name that ends in .png",
         )
-        for file in (table if self.town else None, self.picture):
+        for file in (table if self._is_town else None, left_out_csv if self.bays else None, self.picture):
             if file is not None:
                 check_writable(file)
         console = make_console(soft_wrap=True)
-        if self.town:
+        if self._is_town:
             town = import_town(
-                self.place, self.car_parks, listed_only=self.listed_only, bounds=self.box,
-                untagged_kerbs=self.untagged_kerbs, left_hand=self.left_hand,
+                self.place, self.car_parks, bays=self.bays, columns=self.columns, bays_only=not self.town,
+                listed_only=self.listed_only, bounds=self.box, untagged_kerbs=self.untagged_kerbs,
+                left_hand=self.left_hand,
             )  # fmt: skip
         draft = town.draft if town is not None else import_lot(self.place, self._options)
         draft = draft.in_left_hand_traffic() if self.left_hand else draft
         for line in draft.found:
             console.print(line)
         _print_each(console, "guessed", draft.guesses, "cyan")
-        _print_each(console, "left out", draft.left_out, "yellow")
+        bays_out = () if town is None else town.bays_left_out
+        _print_each(console, "left out", [left for left in draft.left_out if left not in bays_out], "yellow")
         if self.picture is not None:
             from parkenv.show.figures.lots import save_import_picture, save_town_picture
 
@@ -335,6 +369,14 @@ class Import(Command):
         if town is not None:
             write_csv(table, TABLE, town.facilities)
             console.print(f"Facilities: {table}")
+        if self.bays is not None:
+            write_csv(
+                left_out_csv,
+                ("reason", "id"),
+                [{"reason": left.reason, "id": name} for left in bays_out for name in left.ids],
+            )
+            rows = [{"reason": left.reason, "bays": len(left.ids), "ids": left.shown} for left in bays_out]
+            print_rows(console, f"Bays that are left out, all in {left_out_csv}", rows, columns=_LEFT_OUT)
         if draft.unread or unread_csv.exists():
             write_csv(unread_csv, [field.name for field in fields(Unread)], map(vars, draft.unread))
             console.print(

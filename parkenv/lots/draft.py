@@ -69,6 +69,7 @@ def read_provenance(path: Path) -> Provenance | None:
         ) from error
 
 
+UNREACHED = "slots that cannot be reached from an entry"  # a reason for leaving out
 NEAR_ON_GLOBE = 1.0
 """Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres."""
 
@@ -131,9 +132,12 @@ class LeftOut:
     def by_reason(cls, listed: Mapping[str, Iterable[str]]) -> tuple[Self, ...]:
         return tuple(cls(reason, tuple(ids)) for reason, ids in listed.items() if ids)
 
+    @property
+    def shown(self) -> str:
+        return ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
+
     def __str__(self) -> str:
-        shown = ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
-        return f"{self.reason}: {len(self.ids)} ({shown})"
+        return f"{self.reason}: {len(self.ids)} ({self.shown})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +206,7 @@ class LotDraft:
         if not lost.any() or lost.all():
             return self
         ids = tuple(self.slot_ids[i] for i in np.flatnonzero(lost))
-        return self._without(lost, LeftOut("slots that cannot be reached from an entry", ids))
+        return self._without(lost, LeftOut(UNREACHED, ids))
 
     def in_left_hand_traffic(self) -> Self:
         """Return the draft where cars keep to the left, and those parked along a lane head the way of its traffic."""

@@ -15,7 +15,7 @@
   unknown kind is a dwelling, unless a point within it says otherwise. What is near each other becomes one goal.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +27,10 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, with_extra
 from parkenv.files.file_names import is_plain
-from parkenv.lots.draft import LeftOut, LotDraft
+from parkenv.lots.bays.kerbs import has_kerbs, kerb_slots_of, with_streets_of
+from parkenv.lots.bays.register import Register, Rule, read_bays
+from parkenv.lots.bays.rules import rules_text, tags_of
+from parkenv.lots.draft import UNREACHED, LeftOut, LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots, nearest_on_lanes
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.conditions import RESERVED_PLACES, closed_parking, note_other_keys
@@ -70,13 +73,14 @@ from parkenv.lots.town.supply import (
     strip_side,
     table_of,
 )
-from parkenv.lots.unread import note_unread, unread_table
+from parkenv.lots.unread import Unread, note_unread, unread_table
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_REACH
 from parkenv.world.lot import Lane
 from parkenv.world.tariff import PUBLIC
 
 ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
+AROUND_BAYS = 300.0  # m, from the bays of a register within which its map is read
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
@@ -95,6 +99,7 @@ class TownDraft:
 
     draft: LotDraft
     facilities: list[dict[str, Any]]
+    bays_left_out: tuple[LeftOut, ...] = ()  # of a register
 
     @property
     def caution(self) -> str:
@@ -115,6 +120,9 @@ def import_town(
     path: str | Path,
     car_parks: str | Path | None = None,
     *,
+    bays: str | Path | None = None,
+    columns: Mapping[str, str] | None = None,
+    bays_only: bool = False,
     listed_only: bool = False,
     bounds: tuple[tuple[float, float], tuple[float, float]] | None = None,
     untagged_kerbs: float = 1.0,
@@ -123,23 +131,65 @@ def import_town(
     """Draft a town from an OpenStreetMap file; see the module for the rules.
 
     Names and capacities of a list of car parks win; `listed_only` leaves out other parking and streets on no shortest
-    way to them. The map is cut at `bounds`, two pairs of latitude and longitude; `untagged_kerbs` multiplies places.
+    way to them. A register of `bays` (`parkenv.lots.bays.register`) is in place of the map's kerbs, and with `bays_only`
+    of its car parks, too; without bounds, the map is cut `AROUND_BAYS` from its bays. The map is cut at `bounds`, two pairs of latitude and longitude; `untagged_kerbs` multiplies places.
     """
     path = Path(path)
     listed = [] if car_parks is None else read_listed(Path(car_parks))
     with unread_table() as unread, naming(path):
         place = read_map(path)
-        town = _TownImport(place_name(path), place if bounds is None else place.within(bounds), left_hand)
-        town.read_drawn()
-        town.read_kerbs(untagged_kerbs)
-        town.read_counted()
+        register = None if bays is None else read_bays(bays, columns)
+        if register is not None:
+            place, register = _around_bays(place, register, bounds, bays_only)
+        elif bounds is not None:
+            place = place.within(bounds)
+        town = _TownImport(place_name(path), place, left_hand)
+        if not bays_only:
+            town.read_drawn()
+        if register is not None:
+            with naming(bays):
+                town.use_bays(register)
+        else:
+            town.read_kerbs(untagged_kerbs)
+        if not bays_only:
+            town.read_counted()
         if listed:
             town.use_list(listed)
         if listed_only:
             town.rows = [row for row in town.rows if row.capacity_from == "list"]
             town.beside = np.array([row.xy for row in town.rows]).reshape(-1, 2)
         whole = town.draft()
-    return replace(whole, draft=replace(whole.draft, unread=unread.rows))
+    notes = (*unread.rows, *(Unread(*key[:2], n, key[2]) for key, n in town.unread.items()))
+    return replace(whole, draft=replace(whole.draft, unread=notes))
+
+
+def _around_bays(
+    place: OsmMap,
+    register: Register,
+    bounds: tuple[tuple[float, float], tuple[float, float]] | None,
+    bays_only: bool,
+) -> tuple[OsmMap, Register]:
+    """Return the part of a map around the bays of a register, or within bounds, and the bays there."""
+    if not register.ids:
+        raise InputError(f"no bay of the register can be used: {'; '.join(map(str, LeftOut.by_reason(register.left_out)))}")
+    if bounds is not None:
+        register = register.within(*np.min(bounds, axis=0).tolist(), *np.max(bounds, axis=0).tolist())
+        if not register.ids:
+            raise InputError(f"no bay of the register lies within {bounds[0]} to {bounds[1]}")
+    try:
+        place = place.within(register.box(AROUND_BAYS) if bounds is None else bounds)
+    except InputError as error:
+        raise InputError(f"{error}: {no_streets(register)}") from error
+    return replace(place, elements=with_streets_of(register, place.elements)) if bays_only else place, register
+
+
+def no_streets(register: Register) -> str:
+    """Say how to get the streets of a register."""
+    box = ",".join(f"{degrees:.5f}" for corner in register.box(AROUND_BAYS) for degrees in corner)
+    return (
+        f"want the streets of {box} (south, west, north, east), by overpass-turbo.eu: way[highway]({box});(._;>;);out; or "
+        "from download.geofabrik.de or extract.bbbike.org; examples/streets_of_bays.py makes some of the bays alone"
+    )
 
 
 class _TownImport(MapImport):
@@ -167,6 +217,10 @@ class _TownImport(MapImport):
         self.names: set[str] = set()
         self.used: set[int] = set()  # parking areas whose places are slots
         self.beside: FloatArray | None = None  # what is near these attracts, if not everything does
+        self.unread: Counter[tuple[str, str, str]] = Counter()  # of the rules of a register: part, text, assumed
+        self.bays = frozenset[str]()  # ids of the slots of a register
+        self.bay_reasons = {NO_AISLE, UNREACHED}  # why bays of a register are left out
+        self.bays_found: list[str] = []
         self.listed: list[str] = []  # which facilities car parks of a list are
 
     def _is_open(self, element: OsmElement) -> bool:
@@ -270,6 +324,43 @@ class _TownImport(MapImport):
             row.slots = slots[start:end]
             row.slot_rules = [row.rules] * len(row.slots)
         self.rows += [row for row in rows if len(row.slots)]
+
+    def use_bays(self, register: Register) -> None:
+        """Add the bays of a register as slots at the kerbs of streets, a facility for each side of a way."""
+        roads = [road for road in self.roads if has_kerbs(road)]
+        kerbs = kerb_slots_of(register, roads, self.frame) if roads else None
+        if kerbs is None or not len(kerbs.slots):
+            why = "; ".join(map(str, LeftOut.by_reason(kerbs.left_out if kerbs else {})))
+            raise InputError(f"no bay stands at a street of the map ({why}); {no_streets(register)}")
+        for reason, ids in (*register.left_out.items(), *kerbs.left_out.items()):
+            self.left_out[reason] += ids
+            self.bay_reasons.add(reason)
+        n_out = sum(map(len, (*register.left_out.values(), *kerbs.left_out.values())))
+        self.bays, self.n_bays = frozenset(kerbs.ids), len(kerbs.ids) + n_out
+        self.bays_found = list(register.found)
+        rules: dict[tuple[Rule, ...], Rules] = {}
+        for own, count in Counter(register.rules[i] for i in kerbs.bay.tolist()).items():
+            tags, notes = tags_of(own)
+            with unread_table() as unread:
+                rules[own] = rules_of(tags)
+            for note in notes:
+                self.unread[note.tag, note.value, note.assumed] += count
+            for note in unread.rows:
+                self.unread[note.tag.removesuffix(":conditional"), rules_text(own), note.assumed] += count
+        rows: dict[str, list[int]] = defaultdict(list)
+        street: dict[str, str] = {}
+        for i, (k, is_left) in enumerate(zip(kerbs.road.tolist(), kerbs.is_left.tolist(), strict=True)):
+            element = f"{roads[k].id} {roads[k].side_of_way('left' if is_left else 'right')}"
+            rows[element].append(i)
+            street[element] = roads[k].tags.get("name", "")
+        for element, index in rows.items():
+            own_rules = [rules[register.rules[b]] for b in kerbs.bay[index].tolist()]
+            usual = Counter(own_rules).most_common(1)[0][0]
+            named = f"{street[element]} ({element})" if is_plain(street[element]) and street[element] else ""
+            row = FacilityRow(self._named({"name": named}, element), "kerb", usual, "register", "", element)
+            row.slots, row.slot_rules = kerbs.slots[np.array(index)], own_rules
+            row.slot_ids = [kerbs.ids[i] for i in index]
+            self.rows.append(row)
 
     def read_counted(self) -> None:
         ways_in = [
@@ -376,7 +467,11 @@ class _TownImport(MapImport):
             zone=np.array(zone, np.str_),
             facility=np.array([self.rows[k].name for k in of.tolist()], np.str_),
         )
-        ids = [f"{row.element}-{i + 1}" for row in self.rows for i in range(len(row.slots))]
+        ids = [
+            name
+            for row in self.rows
+            for name in row.slot_ids or [f"{row.element}-{i + 1}" for i in range(len(row.slots))]
+        ]
         to_lane = nearest_on_lanes(lanes, slots.mouths())[0] - slots.mouths()
         near = np.hypot(*to_lane.T) < SLOT_REACH - 0.01  # a file rounds
         self.left_out[NO_AISLE] += [ids[i] for i in np.flatnonzero(~near).tolist()]
@@ -427,7 +522,8 @@ class _TownImport(MapImport):
         )
         found = (*_findings(self, rows, draft, along), *turns.found, *self.place.cut_elements())
         guesses = (*_guesses(rows, draft), *((ALONG_STREETS,) if along else ()))
-        return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows)
+        bays_out = tuple(left for left in left_out if self.bays and left.reason in self.bay_reasons)
+        return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows, bays_out)
 
 
 def _with_nodes_in_areas(elements: Sequence[OsmElement]) -> tuple[list[OsmElement], list[str]]:
@@ -485,7 +581,7 @@ def _findings(
     yield f"streets: {length.sum() / 1e3:.0f} km, {connected:.1%} of them connected; lanes: {len(draft.lanes)}"
     for kind in ("kerb", "lot", "garage"):
         of_kind = [row for row in rows if row["kind"] == kind]
-        places = dict.fromkeys(("tag", "drawn", "list", "rule"), 0)
+        places = dict.fromkeys(("tag", "drawn", "list", "register", "rule"), 0)
         for row in of_kind:
             places[row["capacity_from"]] += row["capacity"]
         listed = ", ".join(f"{source}: {n:,}" for source, n in places.items() if n)
@@ -494,6 +590,10 @@ def _findings(
     yield f"goals: {len(draft.goals)}, of {'streets' if along else 'buildings and points of interest'}"
     yield f"zones: {', '.join(draft.zone_rules)}"
     yield from (f"of the list: {line}" for line in town.listed)
+    yield from town.bays_found
+    if town.bays:
+        standing = len(town.bays.intersection(draft.slot_ids))
+        yield f"{standing:,} of {town.n_bays:,} bays, {100 * standing / town.n_bays:.0f} %, stand on a street"
     yield f"frame: {town.frame}"
 
 

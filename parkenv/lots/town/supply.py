@@ -303,7 +303,7 @@ GATE_S = 10.0  # s that the barrier of a garage takes for a car
 INSIDE_S = {"garage": (30.0, 120.0), "lot": (10.0, 30.0)}
 """Seconds from the entry of a counted facility to a space, when it is empty and when it is full."""
 TABLE = ("name", "kind", "capacity", "capacity_from", "rule", "zone", "slots", "tagged", "element")
-"""Columns of the table of facilities: `capacity_from` is tag, drawn, list or rule, `rule` which one; `slots` of the
+"""Columns of the table of facilities: `capacity_from` is tag, drawn, list, register or rule, `rule` which one; `slots` of the
 capacity are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a kerb with its
 side."""
 
@@ -315,12 +315,13 @@ class FacilityRow:
     name: str
     kind: str
     rules: Rules
-    capacity_from: str  # `tag`, `drawn`, `rule` or `list`
+    capacity_from: str  # `tag`, `drawn`, `rule`, `list` or `register`
     rule: str  # which rule
     element: str  # of the map; of a kerb with its side
     tagged: int | None = None  # number of places that the tags say
     slots: Slots = NO_SLOTS  # drawn ones
     slot_rules: list[Rules] = field(default_factory=list)
+    slot_ids: list[str] = field(default_factory=list)  # of a register; empty: the element's with numbers
     counted: list[tuple[str, int, Rules]] = field(
         default_factory=list
     )  # name, places, rules of counted parts
