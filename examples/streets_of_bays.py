@@ -25,20 +25,26 @@ from shapely.ops import substring
 from parkenv.lots.bays.register import read_bays
 from parkenv.lots.local_frame import LocalFrame
 
-NEIGHBOUR, IN_LINE, ROOM = 25.0, 2.0, (2.6, 22.0)  # m, within a row; off its line; between cars in facing rows
+NEIGHBOUR, IN_LINE, ROOM = (
+    25.0,
+    2.0,
+    (2.6, 22.0),
+)  # m, within a row; off its line; between cars in facing rows
 KERB_DEPTH = 2.1  # m, of a parked car beside a point or a line at the kerb
 BESIDE, BLOCK, EXTEND = 3.0, 130.0, 45.0  # m, from a single row; between rows of one street; up to a crossing
 STEP, GRID = 12.0, 0.02  # m, between points of a street; to which all is rounded
 
 
 def groups(pairs, n):
-    return connected_components(coo_array((np.ones(len(pairs)), tuple(np.array(pairs).reshape(-1, 2).T)), (n, n)))[1]
+    return connected_components(
+        coo_array((np.ones(len(pairs)), tuple(np.array(pairs).reshape(-1, 2).T)), (n, n))
+    )[1]
 
 
 def rows_of(register, frame):
     """Return rows of bays, (m, 2, 2) m from end to end, their half depths, m, across, and the names of their streets."""
     shapes = shapely.transform(register.shapes, frame.to_xy)
-    kind, names = shapely.get_type_id(shapes), np.array(register.streets)
+    kind, names = shapely.get_type_id(shapes), register.streets.astype(str)
     xy, is_outline = shapely.get_coordinates(shapely.centroid(shapes)), kind == 3
     pairs = cKDTree(xy).query_pairs(NEIGHBOUR, output_type="ndarray")
     pairs = pairs[(names[pairs[:, 0]] == names[pairs[:, 1]]) & (kind[pairs] != 1).all(axis=1)]
@@ -53,7 +59,9 @@ def rows_of(register, frame):
     box = shapely.get_coordinates(shapely.oriented_envelope(shapes[is_outline])).reshape(-1, 5, 2)
     sides = np.diff(box, axis=1)[:, :2]
     own, size = np.arctan2(sides[..., 1], sides[..., 0]), np.hypot(sides[..., 0], sides[..., 1])
-    fits = np.where((total[is_outline] == 0)[:, None], size, np.abs(np.cos(own - angle[is_outline, None]))).argmax(axis=1)
+    fits = np.where(
+        (total[is_outline] == 0)[:, None], size, np.abs(np.cos(own - angle[is_outline, None]))
+    ).argmax(axis=1)
     angle[is_outline] = own[np.arange(len(own)), fits]
     depth[is_outline] = size[np.arange(len(own)), 1 - fits] / 2
     along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -87,7 +95,7 @@ def beside(ends, others):
     return lateral, overlap, np.degrees(np.arccos(np.clip(np.abs(along @ of.T), 0.0, 1.0)))
 
 
-def centre_lines(rows, depth):
+def centre_lines(rows, depth, names):
     """Return a piece of a street beside each row, (m, 2, 2) m."""
     lateral, overlap, turn = beside(rows, rows)
     room = np.abs(lateral) - depth[:, None] - depth
@@ -95,7 +103,9 @@ def centre_lines(rows, depth):
     nearest = np.where(facing, np.abs(lateral), np.inf).argmin(axis=1)
     each = np.arange(len(rows))
     near = np.sign(lateral[each, nearest])
-    shift = np.where(facing.any(axis=1), (lateral[each, nearest] + near * (depth - depth[nearest])) / 2, np.nan)
+    shift = np.where(
+        facing.any(axis=1), (lateral[each, nearest] + near * (depth - depth[nearest])) / 2, np.nan
+    )
     along = (rows[:, 1] - rows[:, 0]) / np.hypot(*(rows[:, 1] - rows[:, 0]).T)[:, None]
     left = np.stack([-along[:, 1], along[:, 0]], axis=1)[:, None]
     known = np.isfinite(shift)
@@ -106,7 +116,17 @@ def centre_lines(rows, depth):
         room = np.abs(lateral) - depth[~known, None]
         in_line = (turn < 8.0) & (overlap > -BLOCK) & (room > 1.5) & (room < ROOM[1] / 2)
         best = np.where(in_line, -overlap, np.inf).argmin(axis=1)
-        shift[~known] = np.where(in_line.any(axis=1), lateral[np.arange(len(best)), best], shift[~known])
+        # House numbers tell the side: odd ones are all on one.
+        parity = np.array(
+            [int(number[1]) % 2 if (number := re.match(r"(\d+)\s", name)) else 2 for name in names]
+        )
+        alike = (parity[~known, None] == parity[known]) & (parity[known] < 2) & (turn < 25.0)
+        away = np.linalg.norm(rows[~known].mean(axis=1)[:, None] - lines[known].mean(axis=1), axis=2)
+        vote = (alike * np.exp(-away / 300.0)) @ (shift[known, None] * left[known, 0])
+        side = np.where((vote * left[~known, 0]).sum(axis=1) < 0.0, -1.0, 1.0)
+        shift[~known] = np.where(
+            in_line.any(axis=1), lateral[np.arange(len(best)), best], side * shift[~known]
+        )
     return rows + shift[:, None, None] * left
 
 
@@ -120,15 +140,14 @@ def streets_of(pieces):
         axis = np.linalg.svd(own - own.mean(axis=0), full_matrices=False)[2][0]
         run = (own - own.mean(axis=0)) @ axis
         step = np.round(run / STEP).astype(int)
-        points = np.array([own[step == i].mean(axis=0) for i in np.unique(step)])
-        ends = [own[run.argmin()], own[run.argmax()]] if len(points) < 2 else [points[0], points[-1]]
-        line = shapely.simplify(shapely.LineString([ends[0], *points[1:-1], ends[1]]), 1.5)
+        points = [own[step == i].mean(axis=0) for i in np.unique(step)[1:-1]]
+        line = shapely.simplify(shapely.LineString([own[run.argmin()], *points, own[run.argmax()]]), 1.5)
         lines.append(line)
     return lines
 
 
-def network(lines):
-    """Return the parts between crossings of one connected network, LineStrings."""
+def network(lines, bays):
+    """Return the parts between crossings of one connected network, LineStrings; links to it keep clear of bays."""
     whole = []
     for line in lines:
         xy = shapely.get_coordinates(line)
@@ -139,17 +158,18 @@ def network(lines):
         others = np.setdiff1d(tree.query(line, predicate="intersects"), [k])
         met = shapely.get_coordinates(shapely.intersection(line, np.array(whole)[others]))
         at = shapely.line_locate_point(line, shapely.points(met))
-        start, end = min([EXTEND, *at]) - 1.0, max([line.length - EXTEND, *at]) + 1.0
-        cut.append(substring(line, max(start, 0.0), min(end, line.length)))
+        cut.append(substring(line, min([EXTEND, *at]), max([line.length - EXTEND, *at])))
     while True:
         parts = shapely.get_parts(shapely.union_all(cut, grid_size=GRID))
         group = groups(ends_of(parts), ends_of(parts).max() + 1)[ends_of(parts)[:, 0]]
         _, group = np.unique(group, return_inverse=True)
         if group.max() == 0:
             return parts
-        wholes = np.array([shapely.union_all(parts[group == k]) for k in range(group.max() + 1)])
-        nearest = (shapely.distance(wholes[0], other) for other in wholes[1:])
-        cut = [*parts, shapely.shortest_line(wholes[0], wholes[1 + int(np.argmin(list(nearest)))])]
+        here, there = (shapely.union_all(parts[is_here]) for is_here in (group == 0, group != 0))
+        links = shapely.shortest_line(shapely.points(shapely.get_coordinates(here)), there)
+        through = shapely.STRtree(bays).query(links, predicate="dwithin", distance=1.0)[0]
+        cost = shapely.length(links) * np.where(np.isin(np.arange(len(links)), through), 5.0, 1.0)
+        cut = [*parts, links[cost.argmin()]]
 
 
 def ends_of(parts):
@@ -182,12 +202,16 @@ def main():
     register = read_bays(given.register, dict(pair.split("=") for pair in given.columns.split(",") if pair))
     frame = LocalFrame.around(shapely.get_coordinates(shapely.centroid(register.shapes)))
     rows, depth, names = rows_of(register, frame)
-    pieces = centre_lines(rows, depth)
-    parts = network(streets_of(pieces))
-    nearest = shapely.STRtree(shapely.linestrings(pieces)).nearest(shapely.line_interpolate_point(parts, 0.5, normalized=True))
+    pieces = centre_lines(rows, depth, names)
+    parts = network(streets_of(pieces), shapely.transform(register.shapes, frame.to_xy))
+    nearest = shapely.STRtree(shapely.linestrings(pieces)).nearest(
+        shapely.line_interpolate_point(parts, 0.5, normalized=True)
+    )
     titles = [re.sub(r"^\d+\s+|\s+between\s.*", "", names[k]) for k in nearest]
     write_osm(given.out, parts, titles, frame)
-    print(f"{len(register.ids)} bays in {len(rows)} rows, {shapely.length(parts).sum() / 1e3:.1f} km of streets: {given.out}")
+    print(
+        f"{len(register.ids)} bays in {len(rows)} rows, {shapely.length(parts).sum() / 1e3:.1f} km of streets: {given.out}"
+    )
 
 
 if __name__ == "__main__":

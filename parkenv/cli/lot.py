@@ -179,8 +179,8 @@ class Import(Command):
     With --town, a whole town becomes one lot: streets, kerbs, car parks and garages with prices and rules, entries at
     its edge, and goals with weights of demand. A table of its facilities (.csv) gives name, kind, capacity, and the
     source of the capacity: the map (tag, drawn) or a rule.
-    With --bays, the bays of a city's register become slots at the kerbs of the map's streets: points (meters), outlines, or
-    kerb lines with counts, with their ids and rules. With --town, car parks of the map are imported, too.
+    With --bays, the bays of a city's register become slots at the kerbs of the map's streets, with their ids and rules:
+    points (meters), outlines, or kerb lines with counts. With --town, car parks of the map are imported, too.
 
     If something is missing, the picture is still drawn, but no lot is written and the exit code is 2.
     """
@@ -192,7 +192,7 @@ class Import(Command):
         parkenv lot import town.geojson --split --out lots
         parkenv lot import town.osm.pbf --town --out town.geojson --picture town.png
         parkenv lot import map.osm --town --around 49.5,11.3,800 --out part.geojson
-        parkenv lot import streets.osm.pbf --bays meters.csv --columns bay=SpaceID,limit=TimeLimit --out kerbs.geojson
+        parkenv lot import streets.osm --bays meters.csv --out kerbs.geojson
         """
 
     place: Place
@@ -234,7 +234,7 @@ class Import(Command):
     town: bool = option(False, "Import a whole town as one lot; entries and goals are those of the map.")
     bays: Path | None = option(
         None,
-        "Register of bays at the kerb (.csv, .geojson, also .gz): the only kerb parking of the lot. What does not fit is "
+        "Register of bays at the kerb (.csv, .geojson, .gz): the only kerbs of the lot. Bays that fit no street are "
         "left out, and listed in a table beside the lot.",
         takes="REGISTER",
         default="none",

@@ -1,10 +1,11 @@
 """Bays of a register as slots at the kerbs of streets.
 
-A bay stands at the nearest street: of streets about as near, one of its name wins, of outlines also one along or across
-the bay; service roads come last. Its slot is where the register says, on the same side of the street, up to `SHIFT` off:
+A bay stands at the nearest street: of streets about as near, one of its name wins, for outlines and kerb lines one of
+its bearing; service roads come last. Its slot is on its side of the street, where the register says, or up to `SHIFT`
+from there, so that it is off the carriageway and within reach of its lane:
 
-- Points are meters at the kerb's edge: slots lie between kerb and street, along it, or across it where at least
-  `ROW` neighbours are 2.2 to 3.3 m apart on average. Along a kerb they are spread, by least squares, until none overlaps:
+- Points are meters at the kerb's edge: slots lie between kerb and street, along it, or across it where at least `ROW`
+  neighbours are 2.2 to 3.3 m apart on average. Along a kerb they are spread, by least squares, until none overlaps:
   several spaces of one meter get places side by side.
 - Outlines are slots as drawn, along the street where their longer sides are within 30° of it, else across it.
 - A kerb line has as many slots as its capacity, evenly spaced.
@@ -12,8 +13,8 @@ the bay; service roads come last. Its slot is where the register says, on the sa
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -22,199 +23,154 @@ from scipy.optimize import isotonic_regression
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.lots.bays.register import Register
+from parkenv.lots.draft import LeftOut
 from parkenv.lots.generators import BAY_SIZE, KERB_SIZE, Slots
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.elements import OsmElement
 from parkenv.lots.osm.parking import without_overlaps
 from parkenv.lots.osm.roads import Rank, Road
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Mouth
 
-REACH = 20.0  # m, from a bay within which streets are looked for
-SERVICE_BEYOND = 12.0  # m, from the nearest street beyond which a bay may be at a service road
+REACH = 20.0  # m, from a bay within which its street is looked for
 SHIFT = 4.9  # m, most between a slot's centre and its bay
 NAME_BONUS, SERVICE_MALUS, BEARING_MALUS = 3.0, 8.0, 4.0  # m, of the distance to a street
 ALONG = np.radians(30.0)  # largest angle between a street and the longer sides of a slot along it
-NEAREST = (1.5, 2.0)  # m, least distance of a slot from the centre line of a one-way and of a two-way street
-FARTHEST = SLOT_REACH - 0.2  # m, most
+NEAREST, FARTHEST = (
+    (1.5, 2.0),
+    SLOT_REACH - 0.2,
+)  # m, from the centre line, of a one-way or a two-way street, to a slot
 ROW, APART, ANGLED = 4, 12.0, (2.2, 3.3)
 """Bays of a row at least, m between neighbours in a row, and mean spacing, m, of a row of slots across the street."""
 SHORTEST = 4.5  # m, shortest slot along a street
 LARGEST = 60.0  # m², largest outline of a bay
-OVERLAP = 0.5  # m, two slots that overlap by less are drawn so
-
-NO_STREET = f"bays without a street within {REACH:g} m"
-TOO_FAR = f"bays whose slot would be more than {SHIFT:g} m off"
-NO_SIDE = "bays on the centre line of their street"
-NO_ROOM = f"bays without room at the kerb within {SHIFT:g} m, beside others"
-SAME_PLACE = "bays at the place of another one"
-TOO_LARGE = f"outlines larger than {LARGEST:g} m²"
-OTHER_STREET = "bays nearer to a street that crosses theirs"
+OVERLAP = 0.5  # m, slots that overlap by less are drawn so
+ON_IT = 0.8  # m, from the centre line of a street, which is free of slots
 
 
-@dataclass(frozen=True, eq=False)
-class KerbSlots:
+class KerbSlots(NamedTuple):
     """n slots of a register, in its order."""
 
     slots: Slots
-    ids: tuple[str, ...]  # the bays'; of a kerb line with a number
+    ids: list[str]  # the bays'; of a kerb line with a number
     bay: IntArray  # (n,) index of the bay or kerb line in the register
     road: IntArray  # (n,) index of the road
     is_left: BoolArray  # (n,) whether they are on its left, in the order of its points
-    left_out: dict[str, list[str]]  # ids by reason
-    nearest: float  # m, least distance of a bay to a road; infinite if there is none
+    left_out: tuple[LeftOut, ...]
 
 
-@dataclass(eq=False)
-class _Bays:
+class _Places(NamedTuple):
     """n places that a register names, in the lot's frame."""
 
-    ids: NDArray[np.str_]
+    ids: list[str]
     bay: IntArray  # (n,) index in the register
     xy: FloatArray  # (n, 2) m, centres of outlines, else places at the kerb
     axis: FloatArray  # (n, 2) unit vectors along kerb lines and the longer sides of outlines; zeros of points
     size: FloatArray  # (n, 2) m, length and width of outlines; infinite for others
     spacing: FloatArray  # (n,) m, between the places of a kerb line; infinite for others
 
-    def __getitem__(self, index: IntArray | BoolArray) -> "_Bays":
-        return _Bays(*(getattr(self, f.name)[index] for f in fields(self)))
 
-    @property
-    def is_drawn(self) -> BoolArray:
-        return np.isfinite(self.size[:, 0])
-
-
-def _bays_of(register: Register, frame: LocalFrame) -> _Bays:
-    """Return the places of a register: one of a bay, as many of a kerb line as it has spaces."""
-    shapes = shapely.transform(register.shapes, frame.to_xy)
-    count, kind = register.capacity, shapely.get_type_id(shapes)
+def _places(register: Register, frame: LocalFrame) -> _Places:
+    shapes, count = shapely.transform(register.shapes, frame.to_xy), register.capacity
     bay = np.repeat(np.arange(len(shapes)), count)
     rank = np.arange(len(bay)) - np.repeat(np.cumsum(count) - count, count)
-    is_line, is_outline = (kind == shapely.GeometryType[name] for name in ("LINESTRING", "POLYGON"))
-    length = np.where(is_line, shapely.length(shapes), np.inf)
-    axis, size, xy = np.zeros((len(bay), 2)), np.full((len(bay), 2), np.inf), np.empty((len(bay), 2))
-    own = is_line[bay]
+    kind = shapely.get_type_id(shapes)
+    is_line, is_outline = kind == shapely.GeometryType.LINESTRING, kind == shapely.GeometryType.POLYGON
+    xy = shapely.get_coordinates(shapely.centroid(shapes))[bay]
+    axis, size = np.zeros_like(xy), np.full_like(xy, np.inf)
+    own, lines = is_line[bay], shapes[bay[is_line[bay]]]
     share = (rank[own] + 0.5) / count[bay[own]]
-    xy[own] = shapely.get_coordinates(shapely.line_interpolate_point(shapes[bay[own]], share, normalized=True))
-    ends = [shapely.get_coordinates(shapely.get_point(shapes[bay[own]], k)) for k in (0, -1)]
-    axis[own] = _unit(ends[1] - ends[0])
+    xy[own] = shapely.get_coordinates(shapely.line_interpolate_point(lines, share, normalized=True))
+    first, last = (shapely.get_coordinates(shapely.get_point(lines, end)) for end in (0, -1))
+    axis[own] = last - first
+    corners = shapely.get_coordinates(shapely.oriented_envelope(shapes[is_outline])).reshape(-1, 5, 2)
+    sides = np.diff(corners, axis=1)[:, :2]
+    length = np.hypot(sides[..., 0], sides[..., 1])
     own = is_outline[bay]
-    sides = np.diff(shapely.get_coordinates(shapely.oriented_envelope(shapes[bay[own]])).reshape(-1, 5, 2), axis=1)
-    one, other = np.hypot(*sides[:, 0].T), np.hypot(*sides[:, 1].T)
-    axis[own] = _unit(np.where((one >= other)[:, None], sides[:, 0], sides[:, 1]))
-    size[own] = np.stack([np.maximum(one, other), np.minimum(one, other)], axis=1)
-    xy[~is_line[bay]] = shapely.get_coordinates(shapely.centroid(shapes[~is_line]))
-    ids = np.array(register.ids, np.str_)[bay]
-    numbered = np.flatnonzero(is_line[bay])
-    names = ids.astype(object)
-    names[numbered] = [f"{ids[i]}-{rank[i] + 1}" for i in numbered.tolist()]
-    return _Bays(names, bay, xy, axis, size, length[bay] / count[bay])
-
-
-def has_kerbs(road: Road) -> bool:
-    """Whether bays may stand at a road: not on motorways, in tunnels, and beyond the map."""
-    of_map = road.tags["highway"] not in ("motorway", "motorway_link", "trunk_link")
-    return of_map and road.tags.get("tunnel", "no") == "no" and not road.id.startswith("beyond")
-
-
-def with_streets_of(register: Register, elements: Sequence[OsmElement]) -> list[OsmElement]:
-    """Return the elements of a map without parking, and with those service roads alone that serve bays far from streets."""
-    ways = [e for e in elements if "highway" in e.tags and not e.is_node and e.lines]
-    is_service = np.array([e.tags["highway"] == "service" for e in ways], bool)
-    xy = shapely.get_coordinates(shapely.centroid(register.shapes))
-    frame = LocalFrame.around(xy)
-    points = shapely.points(frame.to_xy(xy))
-    lines = np.array([shapely.MultiLineString([frame.to_xy(line) for line in e.lines]) for e in ways], np.object_)
-    near = shapely.STRtree(lines[~is_service]).query(points, predicate="dwithin", distance=SERVICE_BEYOND)[0]
-    points = np.delete(points, np.unique(near))
-    serving = shapely.STRtree(lines[is_service]).query_nearest(points, max_distance=REACH)[1]
-    used = {ways[i].id for i in np.flatnonzero(is_service)[serving].tolist()}
-    return [
-        e
-        for e in elements
-        if not e.tags.get("amenity", "").startswith("parking")
-        and (e.is_node or e.tags.get("highway") != "service" or e.id in used)
+    axis[own] = sides[np.arange(len(sides)), length.argmax(axis=1)]
+    size[own] = np.sort(length, axis=1)[:, ::-1]
+    axis /= np.maximum(np.hypot(axis[:, 0], axis[:, 1]), 1e-9)[:, None]
+    ids = [
+        f"{name}-{k + 1}" if numbered else name
+        for name, k, numbered in zip(
+            register.ids[bay].tolist(), rank.tolist(), is_line[bay].tolist(), strict=True
+        )
     ]
+    spacing = np.where(is_line, shapely.length(shapes) / count, np.inf)[bay]
+    return _Places(ids, bay, xy, axis, size, spacing)
 
 
 def kerb_slots_of(register: Register, roads: Sequence[Road], frame: LocalFrame) -> KerbSlots:
     """Return the slots of a register at the kerbs of roads, on the side of its bays."""
-    left_out: dict[str, list[str]] = {}
+    places, legs = _places(register, frame), _Legs(roads)
+    is_drawn = np.isfinite(places.size[:, 0])
+    reasons = np.zeros(len(places.xy), object)  # why places are left out; 0: they are not
 
-    def fitting(fits: BoolArray, reason: str) -> IntArray:
-        left_out.setdefault(reason, []).extend(bays.ids[~fits].tolist())
-        return np.flatnonzero(fits)
+    def leave_out(which: BoolArray, reason: str) -> None:
+        reasons[which & (reasons == 0)] = reason
 
-    bays, legs = _bays_of(register, frame), _Legs(roads)
-    away = legs.tree.query_nearest(shapely.points(bays.xy), all_matches=False, return_distance=True)[1]
-    bays = bays[fitting(~bays.is_drawn | (bays.size.prod(axis=1) <= LARGEST), TOO_LARGE)]
-    leg = legs.serving(bays, register.streets)
-    index = fitting(leg >= 0, NO_STREET)
-    bays, leg = bays[index], leg[index]
-    foot, across = legs.foot(leg, bays.xy)
-    index = fitting(np.abs(across) > 0.1, NO_SIDE)
-    bays, leg, foot, across = bays[index], leg[index], foot[index], across[index]
+    leave_out(is_drawn & (places.size.prod(axis=1) > LARGEST), f"outlines larger than {LARGEST:g} m²")
+    leg = legs.serving(places, register.streets)
+    leave_out(leg < 0, f"bays without a street within {REACH:g} m")
+    run, beyond, across = legs.at(leg, places.xy)
+    leave_out(np.abs(across) < 0.1, "bays on the centre line of their street")
 
-    road, along, is_left, is_drawn = legs.road[leg], legs.along[leg], across > 0.0, bays.is_drawn
-    outward = np.where(is_left, 1.0, -1.0)[:, None] * np.stack([-along[:, 1], along[:, 0]], axis=1)
-    station = legs.station[leg] + ((foot - legs.start[leg]) * along).sum(axis=1)
-    kerb = 2 * road + is_left
-    gap, mean = _spacing(kerb, station)
-    gap, mean = np.minimum(gap, bays.spacing), np.minimum(mean, bays.spacing)
-    sine = np.where(is_drawn, np.abs((bays.axis * outward).sum(axis=1)), 1.0)
-    in_row = (mean >= ANGLED[0]) & (mean < ANGLED[1])
-    is_angled = np.where(is_drawn, sine > np.sin(ALONG), in_row)
+    road, along, is_left = legs.road[leg], legs.along[leg], across > 0.0
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    outward = np.where(is_left, 1.0, -1.0)[:, None] * left
+    station = legs.station[leg] + run
+    kerb = np.where(reasons == 0, 2 * road + is_left, -1 - np.arange(len(road)))
+    gap, mean = (np.minimum(values, places.spacing) for values in _spacing(kerb, station))
+    sine = np.where(is_drawn, np.abs((places.axis * outward).sum(axis=1)), 1.0)
+    is_angled = np.where(is_drawn, sine > np.sin(ALONG), (mean >= ANGLED[0]) & (mean < ANGLED[1]))
     length = np.where(is_angled, BAY_SIZE[0], np.clip(gap, SHORTEST, KERB_SIZE[0]))
     width = np.where(is_angled, np.clip(gap, ANGLED[0], BAY_SIZE[1]), KERB_SIZE[1])
-    length, width = np.where(is_drawn, bays.size.T, [length, width])
-    slide = np.where(is_drawn, 0.0, _spread(kerb, station, np.where(is_angled, width, length)) - station)
+    length, width = np.where(is_drawn, places.size.T, [length, width])
+    # Along the street: to where it ends, and away from neighbours.
+    slide = np.clip(beyond, -1.5, 1.5) - beyond
+    slide += np.where(is_drawn, 0.0, _spread(kerb, station, np.where(is_angled, width, length)) - station)
 
-    oneway = np.array([r.oneway for r in roads])[road]
     # Cars along a two-way street head the way of the traffic on their side.
-    near_left = np.array([r.near_side == "left" for r in roads])[road]
+    oneway, near_left = np.array([(r.oneway, r.near_side == "left") for r in roads])[road].T
     heading = np.where(oneway | (is_left == near_left), 1.0, -1.0)[:, None] * along
     front = np.where(is_angled[:, None], outward, heading)
-    nose = np.where(is_drawn[:, None], bays.axis, front)
+    nose = np.where(is_drawn[:, None], places.axis, front)
     nose = nose * np.where((nose * front).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
-    # Distance across the street from the slot's centre to its mouth, and from the mouth to the centre line.
+    is_left_of_car = heading[:, 0] * outward[:, 1] - heading[:, 1] * outward[:, 0] > 0.0
+    mouth = np.where(is_angled, Mouth.REAR, np.where(is_left_of_car, Mouth.RIGHT, Mouth.LEFT)).astype(np.int8)
+    # Distances across the street, from a slot's centre to its mouth, and from there to the centre line.
     depth = np.where(is_angled, length / 2 * sine, width / 2)
     to_line = np.abs(across) - depth * np.where(is_drawn, 1.0, 2.0)
-    is_right_of_car = (heading[:, 0] * outward[:, 1] - heading[:, 1] * outward[:, 0]) < 0.0
-    mouth = np.where(is_angled, Mouth.REAR, np.where(is_right_of_car, Mouth.LEFT, Mouth.RIGHT)).astype(np.int8)
 
-    def placed(gap: FloatArray) -> tuple[Slots, FloatArray]:
-        shift = np.clip(gap, np.where(oneway, *NEAREST), FARTHEST) + depth - np.abs(across)
-        xy = bays.xy + slide[:, None] * along + shift[:, None] * outward
+    def placed(to_line: FloatArray) -> tuple[Slots, FloatArray]:
+        shift = np.clip(to_line, np.where(oneway, *NEAREST), FARTHEST) + depth - np.abs(across)
+        xy = places.xy + slide[:, None] * along + shift[:, None] * outward
         return Slots(xy, np.arctan2(nose[:, 1], nose[:, 0]), length, width, mouth), np.hypot(slide, shift)
 
-    # The drive graph takes the nearest street: at a corner, a mouth is moved nearer to its own.
-    slots, off = placed(to_line)
-    slots, off = placed(np.minimum(to_line, legs.nearest_crossing(slots.mouths(), leg) - 0.3))
-    own = np.abs(legs.foot(leg, slots.mouths())[1])
-    checks = (
-        (np.abs(slide) <= SHIFT, NO_ROOM),
-        (off <= SHIFT, TOO_FAR),
-        (legs.nearest_crossing(slots.mouths(), leg) > own, OTHER_STREET),
-        (without_overlaps(slots.boxes(OVERLAP)), SAME_PLACE),
+    # A car gets to a slot by the lane nearest to its mouth: at a corner, it is moved nearer to its own street.
+    crossing = legs.nearest_crossing(placed(to_line)[0].mouths(), leg)
+    slots, off = placed(np.minimum(to_line, crossing - 0.3))
+    own = np.hypot(*legs.at(leg, slots.mouths())[1:])
+    leave_out(np.abs(slide) > SHIFT, f"bays without room at the kerb within {SHIFT:g} m, beside others")
+    leave_out(off > SHIFT, f"bays whose slot would be more than {SHIFT:g} m off")
+    leave_out(
+        legs.nearest_crossing(slots.mouths(), leg) <= own, "bays nearer to a street that crosses theirs"
     )
-    good = np.ones(len(leg), bool)
-    for fits, reason in checks:
-        fitting(fits | ~good, reason)
-        good &= fits
-    index = np.flatnonzero(good)
+    leave_out(legs.are_near(slots.boxes(), ON_IT), "bays on a street")
+    index = np.flatnonzero(reasons == 0)
+    reasons[index[~without_overlaps(slots.boxes(OVERLAP)[index])]] = "bays at the place of another one"
+    index = np.flatnonzero(reasons == 0)
+    ids = np.array(places.ids, np.object_)
+    lost = {
+        str(reason): ids[reasons == reason].tolist() for reason in dict.fromkeys(reasons.tolist()) if reason
+    }
     return KerbSlots(
         slots[index],
-        tuple(bays.ids[index].tolist()),
-        bays.bay[index],
+        ids[index].tolist(),
+        places.bay[index],
         road[index],
         is_left[index],
-        {reason: ids for reason, ids in left_out.items() if ids},
-        float(away.min(initial=np.inf)),
+        LeftOut.by_reason(lost),
     )
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    return vectors / np.maximum(np.hypot(vectors[:, 0], vectors[:, 1]), 1e-9)[:, None]
 
 
 def _spacing(kerb: IntArray, station: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -228,7 +184,7 @@ def _spacing(kerb: IntArray, station: FloatArray) -> tuple[FloatArray, FloatArra
     gap[order] = np.minimum(np.r_[np.inf, step], np.r_[step, np.inf])
     row = np.cumsum(np.r_[0, step > APART])
     count = np.bincount(row)
-    extent = np.bincount(row[1:], np.where(step <= APART, step, 0.0), minlength=len(count)) if len(row) else count
+    extent = np.bincount(row[1:], np.where(step > APART, 0.0, step), minlength=len(count))
     mean[order] = np.where(count >= ROW, extent / np.maximum(count - 1, 1), np.inf)[row]
     return gap, mean
 
@@ -238,52 +194,62 @@ def _spread(kerb: IntArray, station: FloatArray, length: FloatArray) -> FloatArr
     order = np.lexsort((station, kerb))
     room = np.cumsum(np.r_[0.0, (length[order][1:] + length[order][:-1]) / 2])
     # Kerbs are laid out one after the other, with gaps that no bay crosses.
-    start = 1e5 * np.cumsum(np.r_[0, np.diff(kerb[order]) != 0]) if len(order) else np.zeros(0)
+    start = 1e5 * np.cumsum(np.r_[0, np.diff(kerb[order]) != 0]) - room
     result = np.empty(len(station))
-    result[order] = isotonic_regression(station[order] + start - room).x + room - start if len(order) else 0.0
+    result[order] = isotonic_regression(station[order] + start).x - start
     return result
 
 
 class _Legs:
-    """The straight legs of roads, as arrays of n."""
+    """The n straight legs of roads."""
 
     def __init__(self, roads: Sequence[Road]) -> None:
         steps = [np.diff(road.points, axis=0) for road in roads]
-        length = [np.hypot(step[:, 0], step[:, 1]) for step in steps]
+        lengths = [np.hypot(step[:, 0], step[:, 1]) for step in steps]
+        self.length = np.concatenate(lengths)
         self.start = np.concatenate([road.points[:-1] for road in roads])
-        self.length = np.concatenate(length)
         self.along = np.concatenate(steps) / self.length[:, None]
-        self.station = np.concatenate([np.cumsum(own) - own for own in length])  # m from the road's start
-        self.road = np.repeat(np.arange(len(roads)), [len(own) for own in length])
+        self.station = np.concatenate([np.cumsum(own) - own for own in lengths])  # m from the road's start
+        self.road = np.repeat(np.arange(len(roads)), [len(own) for own in lengths])
         self.is_service = np.array([road.rank is not Rank.STREET for road in roads])[self.road]
-        self.names = np.array([road.tags.get("name", "") for road in roads])
-        ends = self.start + self.length[:, None] * self.along
-        self.tree = shapely.STRtree(np.asarray(shapely.linestrings(np.stack([self.start, ends], axis=1))))
+        self.names = np.array([road.tags.get("name", "") for road in roads], np.str_)
+        ends = np.stack([self.start, self.start + self.length[:, None] * self.along], axis=1)
+        self.tree = shapely.STRtree(np.asarray(shapely.linestrings(ends)))
 
-    def foot(self, leg: IntArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the points of legs nearest to points, (n, 2) m, and the distances, (n,) m, positive on the left."""
-        to = xy - self.start[leg]
-        run = np.clip((to * self.along[leg]).sum(axis=1), 0.0, self.length[leg])
-        foot = self.start[leg] + run[:, None] * self.along[leg]
-        is_left = self.along[leg, 0] * to[:, 1] - self.along[leg, 1] * to[:, 0] > 0.0
-        return foot, np.hypot(*(xy - foot).T) * np.where(is_left, 1.0, -1.0)
+    def at(self, leg: IntArray, xy: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return where points, (n, 2) m, are beside legs, m: along it, beyond its ends, and to its left, (n,) each."""
+        to, along = xy - self.start[leg], self.along[leg]
+        ahead = (to * along).sum(axis=1)
+        run = np.clip(ahead, 0.0, self.length[leg])
+        return run, ahead - run, along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0]
 
-    def serving(self, bays: _Bays, streets: Sequence[str]) -> IntArray:
-        """Return the leg at which each bay stands, (n,); -1: none."""
-        bay, leg = self.tree.query(shapely.points(bays.xy), predicate="dwithin", distance=REACH)
-        cost = np.abs(self.foot(leg, bays.xy[bay])[1]) + SERVICE_MALUS * self.is_service[leg]
-        sine = np.abs(bays.axis[bay, 0] * self.along[leg, 1] - bays.axis[bay, 1] * self.along[leg, 0])
-        turn = np.arcsin(np.clip(sine, 0.0, 1.0))
+    def are_near(self, shapes: NDArray[np.object_], distance: float) -> BoolArray:
+        near = np.zeros(len(shapes), bool)
+        near[self.tree.query(shapes, predicate="dwithin", distance=distance)[0]] = True
+        return near
+
+    def serving(self, places: _Places, streets: NDArray[np.object_]) -> IntArray:
+        """Return the leg at which each place is, (n,); -1: none."""
+        place, leg = self.tree.query(shapely.points(places.xy), predicate="dwithin", distance=REACH)
+        cost = np.hypot(*self.at(leg, places.xy[place])[1:]) + SERVICE_MALUS * self.is_service[leg]
+        axis = places.axis[place]
+        turn = np.arcsin(
+            np.clip(np.abs(axis[:, 0] * self.along[leg, 1] - axis[:, 1] * self.along[leg, 0]), 0.0, 1.0)
+        )
         # Outlines may be along their street or across it.
-        turn = np.where(bays.is_drawn[bay], np.minimum(turn, np.pi / 2 - turn), turn)
-        cost += BEARING_MALUS * turn / (np.pi / 4)
-        names, of_bay = np.unique(np.array(streets, np.str_), return_inverse=True)
-        pairs, which = np.unique(np.stack([of_bay[bays.bay[bay]], self.road[leg]]), axis=1, return_inverse=True)
-        alike = [bool(_words(str(names[i])) & _words(str(self.names[k]))) for i, k in pairs.T.tolist()]
+        is_drawn = np.isfinite(places.size[place, 0])
+        cost += BEARING_MALUS / (np.pi / 4) * np.where(is_drawn, np.minimum(turn, np.pi / 2 - turn), turn)
+        names, of_bay = np.unique(streets.astype(str), return_inverse=True)
+        pairs, which = np.unique(
+            np.stack([of_bay[places.bay[place]], self.road[leg]]), axis=1, return_inverse=True
+        )
+        alike = [
+            not _words(str(names[i])).isdisjoint(_words(str(self.names[k]))) for i, k in pairs.T.tolist()
+        ]
         cost -= NAME_BONUS * np.array(alike, np.float64)[which]
-        order = np.lexsort((leg, cost, bay))
-        own, first = np.unique(bay[order], return_index=True)
-        result = np.full(len(bays.xy), -1)
+        order = np.lexsort((leg, cost, place))
+        own, first = np.unique(place[order], return_index=True)
+        result = np.full(len(places.xy), -1)
         result[own] = leg[order[first]]
         return result
 
@@ -291,18 +257,19 @@ class _Legs:
         """Return the distances of points to the nearest leg of another road and bearing than their own, (n,) m."""
         point, leg = self.tree.query(shapely.points(xy), predicate="dwithin", distance=SLOT_REACH + 1.0)
         turned = np.abs((self.along[leg] * self.along[own[point]]).sum(axis=1)) < np.cos(ALONG)
-        other = turned & (self.road[leg] != self.road[own[point]])
+        point, leg = (values[turned & (self.road[leg] != self.road[own[point]])] for values in (point, leg))
         distance = np.full(len(xy), np.inf)
-        away = np.abs(self.foot(leg[other], xy[point[other]])[1])
-        np.minimum.at(distance, point[other], away)
+        np.minimum.at(distance, point, np.hypot(*self.at(leg, xy[point])[1:]))
         return distance
 
 
-_GENERIC = frozenset("street st avenue ave av road rd boulevard blvd bl drive dr lane place pl way the north south east west".split())
+_COMMON = frozenset(
+    ("street", "st", "avenue", "ave", "av", "road", "rd", "boulevard", "blvd", "bl", "north", "south")
+)
 
 
 @lru_cache(maxsize=65536)
 def _words(name: str) -> frozenset[str]:
     """Return the words by which a street is told from others."""
     street = re.split(r"\b(?:between|from)\b", name.casefold())[0]
-    return frozenset(word for word in re.findall(r"\w+", street) if len(word) > 1) - _GENERIC
+    return frozenset(word for word in re.findall(r"\w+", street) if len(word) > 1) - _COMMON

@@ -1,12 +1,13 @@
 """Read a register of bays: points, outlines, or kerb lines with counts, in a table (CSV) or in GeoJSON.
 
-A column is known by a usual name (`SYNONYMS`) or is named by the user. Rows of one id at one place are one bay: their
-rules are joined, and of counts of cars at a kerb line without a capacity the largest one is its capacity. What is no
-bay is left out, by reason.
+Columns are known by usual names, or named by the user. Rows of one id at one place are one bay: their rules are joined;
+a kerb line without a capacity has that of the most cars counted in a row. What is no bay is left out, by reason.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,73 +18,70 @@ import shapely
 import shapely.geometry
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import IntArray
+from parkenv.compiled.arrays import BoolArray, IntArray
 from parkenv.errors import InputError, naming, nearest
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import csv_records, read_json, unpacked_path
 from parkenv.lots.formats.geojson import Positions
-from parkenv.lots.local_frame import LocalFrame
 
 SYNONYMS = {
-    "bay": "bay_id bay space_id meter_id meter_number post_id marker_id st_marker_id kerbside_id blockface block_id block "
-    "block_face_id element_key sensor_id id objectid fid",
-    "lat": "lat latitude y y_coord", "lon": "lon lng long longitude x x_coord",
-    "line": "line geometry the_geom geom wkt shape geo_shape latlng lat_lng location geo_point_2d geo_point geopoint",
-    "street": "block_face street street_name road road_name road_segment_description rd_seg_dsc on_street name",
-    "capacity": "capacity spaces stalls parking_spaces number_of_spaces paid_spaces",
-    "cars": "cars cars_paid_spaces disabled_placard service vehicles occupied_spaces",
-    "limit": "limit time_limit time_limit_min max_stay maxstay duration duration_minutes",
-    "rate": "rate fee price rate_per_hour price_per_hour charge rate_range",
-    "hours": "hours policy parking_policy metered_hours hours_charged paid_hours operating_hours enforced days_times",
-    "class": "class type_desc type category use restriction restriction_display bay_type space_type description",
-    "days": "days restriction_days", "from_day": "from_day fromday", "to_day": "to_day today",
-    "start": "start start_time time_restrictions_start", "end": "end end_time time_restrictions_finish",
-    "disabled_limit": "disability_ext disabled_limit",
-}  # fmt: skip
-"""Usual names of the columns of each part of a register, the surest first; case and signs do not matter."""
-OF_RULES = ("limit", "rate", "hours", "class", "days", "from_day", "to_day", "start", "end", "disabled_limit")
+    "bay": "bayid bay spaceid meterid meternumber postid markerid stmarkerid kerbsideid block blockid id objectid",
+    "lat": "lat latitude y",
+    "lon": "lon lng long longitude x",
+    "line": "line geometry thegeom geom wkt shape latlng latlong location geopoint2d geopoint",
+    "street": "blockface street streetname road roadname roadsegmentdescription rdsegdsc onstreet",
+    "capacity": "capacity spaces stalls parkingspaces numberofspaces paidspaces",
+    "cars": "cars carspaidspaces disabledplacard service vehicles occupiedspaces",
+    "limit": "limit timelimit timelimitmin maxstay duration durationminutes",
+    "rate": "rate fee price rateperhour priceperhour charge raterange",
+    "hours": "hours policy parkingpolicy meteredhours paidhours operatinghours enforced daystimes",
+    "class": "class typedesc type use restriction restrictiondisplay baytype spacetype description",
+    "days": "days restrictiondays",
+    "from_day": "fromday",
+    "to_day": "today",
+    "start": "start starttime timerestrictionsstart",
+    "end": "end endtime timerestrictionsfinish",
+    "disabled_limit": "disabledlimit disabilityext",
+}
+"""Usual names of the columns of each part, without signs, the surest first; of `cars` and `class` all count."""
+OF_RULES = tuple(SYNONYMS)[7:]
 MOST_BYTES = 256_000_000  # of a register
-NO_POSITION, NO_ID, TWICE = "bays without a position", "bays without an id", "bays whose id is that of another place"
-CROSSED, NO_AREA, PARTS = "outlines that cross themselves", "outlines without an area", "bays of several parts"
-NO_CAPACITY = "kerb lines without a capacity, where no car was counted"
-SMALLEST = 1e-11  # degrees², some 0.1 m², an outline that is none
-
 Rule = tuple[tuple[str, str], ...]
-"""What a row says of a rule: pairs of a key of `OF_RULES` and a text."""
+"""What a row says of a rule: pairs of one of `OF_RULES` and a text."""
+Box = tuple[tuple[float, float], tuple[float, float]]
+"""Two corners, latitude and longitude."""
 
 
 @dataclass(frozen=True, eq=False)
 class Register:
-    """n bays or kerb lines, each id once."""
+    """n bays or kerb lines."""
 
-    ids: tuple[str, ...]  # to the letter
+    ids: NDArray[np.object_]  # (n,) unique texts, to the letter
     shapes: NDArray[np.object_]  # (n,) Point, Polygon or LineString, degrees, longitude first
-    streets: tuple[str, ...]  # names; empty: not given
+    streets: NDArray[np.object_]  # (n,) names; empty: not given
     capacity: IntArray  # (n,) number of slots: 1 but at kerb lines
-    rules: tuple[tuple[Rule, ...], ...]  # those of each bay
+    rules: NDArray[np.object_]  # (n,) tuples of `Rule`
     left_out: Mapping[str, Sequence[str]]  # ids, or rows without one, by reason
     found: tuple[str, ...]  # which columns are what, and where capacities come from
 
+    def part(self, kept: BoolArray, reason: str = "") -> Self:
+        """Return the bays kept; the others are left out for a reason, if there is one."""
+        columns = ("ids", "shapes", "streets", "capacity", "rules")
+        lost = {reason: self.ids[~kept].tolist()} if reason else {}
+        own = {name: getattr(self, name)[kept] for name in columns}
+        return replace(self, left_out={**self.left_out, **lost}, **own)
 
-    def within(self, south: float, west: float, north: float, east: float) -> Self:
-        """Return the bays of a box, degrees; others are no bays of the place."""
-        lon, lat = shapely.get_coordinates(shapely.centroid(self.shapes)).T
-        index = np.flatnonzero((lat >= south) & (lat <= north) & (lon >= west) & (lon <= east))
-        names = ("ids", "streets", "rules")
-        own = {name: tuple(getattr(self, name)[i] for i in index.tolist()) for name in names}
-        return replace(self, shapes=self.shapes[index], capacity=self.capacity[index], **own)
+    def within(self, box: Box) -> Self:
+        at = shapely.get_coordinates(shapely.centroid(self.shapes))[:, ::-1]
+        return self.part(((at >= np.min(box, axis=0)) & (at <= np.max(box, axis=0))).all(axis=1))
 
-    def box(self, margin: float) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return the corners, latitude and longitude, of a box around the bays with a margin, m.
-
-        Bays more than a degree from most others are taken for errors.
-        """
-        at = shapely.get_coordinates(shapely.centroid(self.shapes))
+    def box(self, margin: float) -> Box:
+        """Return a box around the bays, without those a degree from most others, with a margin, degrees of latitude."""
+        at = shapely.get_coordinates(shapely.centroid(self.shapes))[:, ::-1]
         at = at[(np.abs(at - np.median(at, axis=0)) <= 1.0).all(axis=1)]
-        corners = LocalFrame.around(at)
-        low, high = corners.to_xy(at).min(axis=0) - margin, corners.to_xy(at).max(axis=0) + margin
-        (west, south), (east, north) = corners.to_lonlat([low, high]).round(6).tolist()
-        return (south, west), (north, east)
+        wide = np.array([margin, margin / max(np.cos(np.radians(at[0, 0])), 0.1)])
+        low, high = (at.min(axis=0) - wide).round(5), (at.max(axis=0) + wide).round(5)
+        return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
 
 
 def read_bays(path: str | Path, columns: Mapping[str, str] | None = None) -> Register:
@@ -94,26 +92,33 @@ def read_bays(path: str | Path, columns: Mapping[str, str] | None = None) -> Reg
         columns: names of columns by part (`SYNONYMS`); several that are added up are joined by `+`.
 
     Raises:
-        InputError: the file cannot be read, or has no column of positions.
+        InputError: the file cannot be read, or has no position or no bay.
     """
     path = Path(path)
     with naming(path):
-        named, records = dict(columns or {}), list(_records(path))
-        if not records:
-            raise InputError("has no bay, want a row or a feature for each")
+        records = list(_records(path))
         names = list(dict.fromkeys(name for _, record, _ in records for name in record))
-        columns_of = _columns(names, named, any(shape is not None for _, _, shape in records))
-        return _register(records, columns_of)
+        own = dict(_usual(tuple(names)))
+        for part, text in (columns or {}).items():
+            own[part] = text.split("+")
+            for name, known in ((part, list(SYNONYMS)), *((name, names) for name in own[part])):
+                if name not in known:
+                    raise InputError(f"--columns has {name!r:.40}; {nearest(name, known)}")
+        if not own.keys() & {"line", "lat"} and not any(shape for _, _, shape in records):
+            raise InputError(
+                f"no position in its columns {', '.join(names)[:400]}; want --columns bay=ID,lat=LATITUDE,"
+                "lon=LONGITUDE or line=POSITIONS"
+            )
+        return _register(records, own)
 
 
 _Record = tuple[str, dict[str, Any], Any]
-"""The name of a row, its columns, and its geometry, degrees; None in a table, and of a feature without a valid one."""
+"""The name of a row, its columns, and the geometry of a feature, degrees, or None."""
 
 
 def _records(path: Path) -> Iterator[_Record]:
     if unpacked_path(path).suffix.lower() == ".csv":
-        for line, record in csv_records(path, MOST_BYTES):
-            yield f"line {line}", dict(record), None
+        yield from ((f"line {line}", dict(record), None) for line, record in csv_records(path, MOST_BYTES))
         return
     document = read_json(path, MOST_BYTES)
     features = document.get("features") if isinstance(document, dict) else None
@@ -124,159 +129,122 @@ def _records(path: Path) -> Iterator[_Record]:
         feature = feature if isinstance(feature, dict) else {}
         properties = feature.get("properties")
         record = dict(properties) if isinstance(properties, dict) else {}
-        if isinstance(feature.get("id"), str | int):
+        if "id" in feature:
             record.setdefault("id", feature["id"])
-        yield f"feature {index}", record, _geometry(feature.get("geometry"), to_lonlat)
-
-
-def _geometry(given: Any, to_lonlat: Any) -> Any:
-    try:
-        shape = shapely.transform(shapely.force_2d(shapely.geometry.shape(given)), to_lonlat)
-        return shapely.get_geometry(shape, 0) if shapely.get_num_geometries(shape) == 1 else shape
-    except (AttributeError, TypeError, ValueError, LookupError, OverflowError, shapely.errors.ShapelyError):
-        return None
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", name.lower())
-
-
-_KNOWN = {part: [_plain(name) for name in names.split()] for part, names in SYNONYMS.items()}
+        shape = None
+        with suppress(
+            AttributeError, TypeError, ValueError, LookupError, OverflowError, shapely.errors.ShapelyError
+        ):
+            shape = shapely.transform(shapely.geometry.shape(feature["geometry"]), to_lonlat)
+        yield f"feature {index}", record, shape
 
 
 @lru_cache(maxsize=256)
-def _ranked(names: tuple[str, ...]) -> Mapping[str, list[str]]:
-    """Return the columns of each part by usual names: the surest one, but all that count cars or name a class."""
+def _usual(names: tuple[str, ...]) -> Mapping[str, list[str]]:
+    """Return the columns of each part by their usual names."""
     found = {}
-    for part, known in _KNOWN.items():
-        ranked = sorted((known.index(_plain(name)), name) for name in names if _plain(name) in known)
-        if ranked:
-            found[part] = [name for _, name in ranked[: None if part in ("cars", "class") else 1]]
+    for part, known in SYNONYMS.items():
+        plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in reversed(names)}
+        if ranked := [plain[name] for name in known.split() if name in plain]:
+            found[part] = ranked[: None if part in ("cars", "class") else 1]
     return found
-
-
-def _columns(names: Sequence[str], named: dict[str, str], has_shapes: bool) -> dict[str, list[str]]:
-    found = dict(_ranked(tuple(names)))
-    for part, text in named.items():
-        if part not in SYNONYMS:
-            raise InputError(f"--columns: no part {part!r:.40} of a register; {nearest(part, SYNONYMS)}")
-        found[part] = text.split("+")
-        for name in found[part]:
-            if name not in names:
-                raise InputError(f"--columns: no column {name!r:.40}; {nearest(name, names)}")
-    if not has_shapes and not ("line" in found or {"lat", "lon"} <= found.keys()):
-        raise InputError(
-            f"no position in its columns {', '.join(names)[:400]}; name them by --columns lat=COLUMN,lon=COLUMN or "
-            "line=COLUMN (and bay=COLUMN, the id)"
-        )
-    return found
-
-
-def _register(records: Sequence[_Record], columns: dict[str, list[str]]) -> Register:
-    left_out: dict[str, list[str]] = {}
-    rows: dict[str, list[dict[str, Any]]] = {}
-    shapes: dict[str, Any] = {}
-    for where, record, shape in records:
-        name = _text(record, columns.get("bay", ())) if "bay" in columns else where
-        if not name or not is_plain(name):
-            left_out.setdefault(NO_ID, []).append(where)
-            continue
-        shape = _shape_in(record, columns) if shape is None else shape
-        reason = _fault(shape) if shape is not None else NO_POSITION
-        if reason is None and name in shapes and not shapely.equals_exact(shapes[name], shape, 1e-7):
-            reason = TWICE
-        if reason is not None:
-            left_out.setdefault(reason, []).append(name)
-            continue
-        shapes.setdefault(name, shapely.line_merge(shape) if "Line" in shape.geom_type else shape)
-        rows.setdefault(name, []).append(record)
-    names = list(rows)
-    is_line = np.array([shape.geom_type == "LineString" for shape in shapes.values()], bool)
-    capacity = np.array(
-        [_capacity(rows[name], columns) if line else 1 for name, line in zip(names, is_line, strict=True)], np.int64
-    )
-    left_out.setdefault(NO_CAPACITY, []).extend(names[k] for k in np.flatnonzero(capacity == 0).tolist())
-    kept = np.flatnonzero(capacity > 0).tolist()
-    found = [f"register: {', '.join(f'{part}: ' + '+'.join(own) for part, own in columns.items())}"]
-    if is_line.any() and "capacity" not in columns:
-        found.append("capacity of kerb lines, which is not given: the most cars in any row")
-    return Register(
-        tuple(names[k] for k in kept),
-        np.array(list(shapes.values()), dtype=np.object_)[kept],
-        tuple(_text(rows[names[k]][0], columns.get("street", ())) for k in kept),
-        capacity[kept],
-        tuple(_rules(rows[names[k]], columns) for k in kept),
-        left_out,
-        tuple(found),
-    )
 
 
 def _text(record: Mapping[str, Any], names: Sequence[str]) -> str:
-    texts = (record.get(name) for name in names)
-    texts = (str(int(text)) if isinstance(text, float) and text.is_integer() else text for text in texts)
-    return " ".join(str(text).strip() for text in texts if text is not None).strip()
+    values = (record.get(name) for name in names)
+    values = (int(value) if isinstance(value, float) and value.is_integer() else value for value in values)
+    return " ".join(str(value).strip() for value in values if value is not None).strip()
 
 
-def _shape_in(record: Mapping[str, Any], columns: dict[str, list[str]]) -> Any:
-    """Return the geometry of a row of a table, degrees, or None: well-known text, GeoJSON, pairs of lat and lon."""
-    numbers = [_text(record, columns.get(part, ())).replace(",", ".") for part in ("lon", "lat")]
+def _register(records: Sequence[_Record], columns: Mapping[str, list[str]]) -> Register:
+    left_out: dict[str, list[str]] = defaultdict(list)
+    shapes: dict[str, Any] = {}
+    rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for where, record, given in records:
+        name = _text(record, columns["bay"]) if "bay" in columns else where
+        shape, reason = _simple(_shape_in(record, columns) if given is None else given)
+        if not name or not is_plain(name):
+            name, reason = where, "bays without an id"
+        elif name in shapes and shape is not None and not shapely.equals_exact(shapes[name], shape, 1e-7):
+            reason = "bays whose id is that of another place"
+        if reason:
+            left_out[reason].append(name)
+        else:
+            shapes.setdefault(name, shape)
+            rows[name].append(record)
+    is_line = [shape.geom_type == "LineString" for shape in shapes.values()]
+    counted = columns.get("capacity") or columns.get("cars") or []
+    found = [f"register: {', '.join(f'{part}: ' + '+'.join(own) for part, own in columns.items())}"]
+    if any(is_line) and "capacity" not in columns:
+        found.append("capacity of kerb lines, which is not given: the most cars in any row")
+    register = Register(
+        _objects(shapes),
+        _objects(shapes.values()),
+        _objects(_text(own[0], columns.get("street", ())) for own in rows.values()),
+        np.array(
+            [_capacity(own, counted) if line else 1 for own, line in zip(rows.values(), is_line, strict=True)]
+        ),
+        _objects(_rules(own, columns) for own in rows.values()),
+        left_out,
+        tuple(found),
+    )
+    register = register.part(register.capacity > 0, "kerb lines without a capacity, where no car was counted")
+    if not len(register.ids):
+        reasons = "; ".join(f"{reason}: {len(ids)}" for reason, ids in register.left_out.items() if ids)
+        raise InputError(f"no bay in it ({reasons or 'it is empty'})")
+    return register
+
+
+def _objects(values: Iterable[Any]) -> NDArray[np.object_]:
+    listed = list(values)
+    array = np.empty(len(listed), object)
+    array[:] = listed
+    return array
+
+
+def _shape_in(record: Mapping[str, Any], columns: Mapping[str, list[str]]) -> Any:
+    """Return the geometry of a row, degrees, or None: well-known text, pairs of latitude and longitude, or columns."""
     text = _text(record, columns.get("line", ()))
-    try:
-        if text[:1] == "{":
-            return shapely.from_geojson(text)
+    numbers = (_text(record, columns.get(part, ())).replace(",", ".") for part in ("lon", "lat"))
+    with suppress(ValueError, shapely.errors.ShapelyError):
         if re.match(r"[A-Za-z]", text):
-            return shapely.force_2d(shapely.from_wkt(text))
-        if text:
-            pairs = np.array(re.findall(r"-?\d+(?:\.\d+)?", text), np.float64).reshape(-1, 2)[:, ::-1]
-            return shapely.Point(pairs[0]) if len(pairs) == 1 else shapely.LineString(pairs)
-        return shapely.Point(*map(float, numbers))
-    except (ValueError, IndexError, shapely.errors.ShapelyError):
-        return None
+            return shapely.from_wkt(text)
+        pairs = np.array(re.findall(r"-?\d+(?:\.\d+)?", text), np.float64).reshape(-1, 2)[:, ::-1]
+        if len(pairs) > 1:
+            return shapely.LineString(pairs)
+        return shapely.Point(pairs[0] if len(pairs) else list(map(float, numbers)))
+    return None
 
 
-def _fault(shape: Any) -> str | None:
-    low_x, low_y, high_x, high_y = shape.bounds if not shape.is_empty else (np.nan,) * 4
-    if not (low_x >= -360.0 and high_x <= 360.0 and low_y >= -90.0 and high_y <= 90.0) or (
-        low_x == high_x == low_y == high_y == 0.0
-    ):
-        return NO_POSITION
-    if shape.geom_type in ("Point", "LineString"):
-        return None
-    if shape.geom_type == "MultiLineString":
-        return None if shapely.line_merge(shape).geom_type == "LineString" else PARTS
-    if shape.geom_type != "Polygon":
-        return PARTS
+def _simple(shape: Any) -> tuple[Any, str]:
+    """Return a shape in one part and in the plane, and why it is no place of a bay, or empty text."""
+    shape = shapely.force_2d(shape)
+    shape = shapely.line_merge(shape) if shapely.get_type_id(shape) == 5 else shape  # a MultiLineString
+    if shape is not None and shapely.get_num_geometries(shape) == 1:
+        shape = shapely.get_geometry(shape, 0)
+    bounds = np.array([np.nan] if shape is None else shape.bounds)
+    if shape is None or not (np.abs(bounds) <= [360.0, 90.0, 360.0, 90.0]).all() or not bounds.any():
+        return None, "bays without a position"
+    if shape.geom_type not in ("Point", "LineString", "Polygon"):
+        return None, "bays of several parts"
     if not shape.is_valid:
-        return CROSSED
-    return NO_AREA if shape.area < SMALLEST else None
+        return None, "outlines that cross themselves"
+    is_flat = shape.geom_type == "Polygon" and shape.area < 1e-11  # degrees², some 0.1 m²
+    return shape, "outlines without an area" if is_flat else ""
 
 
-def _capacity(rows: Sequence[dict[str, Any]], columns: dict[str, list[str]]) -> int:
-    names = columns.get("capacity") or columns.get("cars") or ()
-    numbers = [re.findall(r"\d+(?:\.\d+)?", _text(row, [name])) for row in rows for name in names]
-    counts = [float(found[0]) if found else 0.0 for found in numbers]
-    totals = np.array(counts).reshape(len(rows), -1).sum(axis=1)
-    return int(min(totals.max(initial=0.0), 1_000.0))
+def _capacity(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> int:
+    counts = [[re.match(r"\d+", _text(row, [name])) for name in names] for row in rows]
+    return min(max(sum(int(count[0][:4]) for count in own if count) for own in counts), 1_000)
 
 
-def _rules(rows: Sequence[dict[str, Any]], columns: dict[str, list[str]]) -> tuple[Rule, ...]:
-    """Return the rules of rows: of their columns, of numbered ones (`duration1`, ...), and of lists of objects."""
-    own = {part: columns[part] for part in OF_RULES if part in columns}
+def _rules(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, list[str]]) -> tuple[Rule, ...]:
+    """Return the rules of rows, of their columns and of lists of objects in them."""
     rules: dict[Rule, None] = {}
     for row in rows:
-        listed = [each for value in row.values() if isinstance(value, list) for each in value]
-        given = [(row, own), *((row, parts) for parts in _numbered(tuple(row)))]
-        given += [(each, _ranked(tuple(each))) for each in listed if isinstance(each, dict)]
-        for record, parts in given:
-            texts = ((part, _text(record, parts.get(part, ()))) for part in OF_RULES)
-            if rule := tuple((part, text) for part, text in texts if text):
-                rules[rule] = None
-    return tuple(rules)
-
-
-@lru_cache(maxsize=256)
-def _numbered(names: tuple[str, ...]) -> list[dict[str, list[str]]]:
-    """Return the columns of rules whose names end in the same digit, by part, for each digit."""
-    of_digit = [{name[:-1]: name for name in names if name.endswith(digit)} for digit in "123456789"]
-    parts = [{part: [own[name] for name in its] for part, its in _ranked(tuple(own)).items()} for own in of_digit]
-    return [own for own in parts if not own.keys().isdisjoint(OF_RULES)]
+        listed = (each for value in row.values() if isinstance(value, list) for each in value)
+        given = [(row, columns), *((each, _usual(tuple(each))) for each in listed if isinstance(each, dict))]
+        for record, own in given:
+            texts = ((part, _text(record, own.get(part, ()))) for part in OF_RULES)
+            rules[tuple((part, text) for part, text in texts if text)] = None
+    return tuple(rule for rule in rules if rule)

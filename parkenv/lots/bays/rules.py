@@ -1,160 +1,125 @@
-"""The rules of a register's bays, in words or in columns, as tags of OpenStreetMap, which the importer reads.
+"""The rules of a register's bays, in words or in columns, as tags of OpenStreetMap.
 
-A rule has a class of users, hours, a longest stay and a price. Hours are written as in `TANS 7A-9A, 4P-6P Mon-Fri | PKG
-9A-4P Mon-Fri, 8A-8P Sat` or `1P MTR M-SAT 7.30 TO 18.30`: each time is of the days after it, or of those before it in
-a text that begins with days; without days it is of those of the rule before, else of all. Where nobody may stop (tow-away,
-clearway, taxis) is closed at these hours; at all others the bay is free and open to everybody.
+Hours are read as in `TANS 7A-9A, 4P-6P Mon-Fri | PKG 9A-4P Mon-Fri, 8A-8P Sat` or `1P MTR M-SAT 7.30 TO 18.30`: times
+are of the days after them, in a clause that begins with days of those before; without days, of those of the clause
+before, or of all. Where nobody may stop (tow-away, clearway, taxis), the bay is closed at these hours; at hours that no
+rule names it is free and open to everybody.
 """
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
 from parkenv.compiled.arrays import BoolArray
 from parkenv.lots.bays.register import Rule
 from parkenv.lots.osm.conditions import always, duration, hours_text
-from parkenv.lots.unread import Unread
+from parkenv.world.week import DAY_S, HOUR_S
 
 USERS = {
     "no": r"TANS|TOW|CLEARWAY|NO (?:STOPPING|PARKING|STANDING)|NP|NS|S/|TAXI|BUS|MOTOR ?(?:CYCLES?|BIKES?)|BICYCLES?",
-    "disabled": r"DIS|DISABLED|HANDICAP\w*|ACCESSIBLE|BLUE",
+    "disabled": r"DIS|DISABLED|HANDICAP\w*|ACCESSIBLE",
     "delivery": r"LOADING|LZ|PLO|COMMERCIAL|TRUCKS?",
     "charging": r"EV|ELECTRIC|CHARGING",
-    "permit": r"PERMIT|PP|RESIDENTS?|PERMIT ZONE",
+    "permit": r"PERMIT|PP|RESIDENTS?",
+    "yes": r"GENERAL|PUBLIC|P?METER\w*|MP?T?R?|PKG|PARKING|STANDARD|REGULAR|TIMED|TICKET|TKT|PAY|PAID|\d*/?\d+P|P",
 }
-"""Words of the classes of users other than the public, by OpenStreetMap's access; the first that fits counts."""
-_OPEN = r"GENERAL|PUBLIC|METER\w*|MTR|PKG|PARKING|STANDARD|REGULAR|SHORT|TIMED|TICKET|TKT|\d*/?\d*P|P"
+"""Words of the values of `access`; the first that fits counts."""
 _PAID = r"MP(?=\d)|MTR|P?METER(?:ED)?|TKT|TICKET|PAY|PAID"
-_LIMIT = re.compile(r"(?<![\d.:])(?:(\d+)/(\d+)|(\d+(?:\.\d+)?))\s?P\b", re.I)
-_STAY = re.compile(r"(?<![\w.:-])\d+(?:\.\d+)?\s?(?:MINS?|MINUTES?|M|HRS?|HOURS?|H)\b", re.I)
-_SPELLED = "mon tue wed thu fri sat sun"
-_DAY = r"(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*|tu|th|su|sa|[mfs]"
+_STAY = re.compile(r"(?<![\d.:/])(?:(?P<half>1/\d) ?P|(?P<hours>\d+(?:\.\d)?) ?P|\d+ ?(?:M|H)[A-Z]*)\b", re.I)
+_DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+_DAY = rf"(?:{'|'.join(_DAYS)})[a-z]*|tu|th|su|sa|[mfs]"
 _TIME = r"(?P<h{0}>\d{{1,2}})(?:[:.](?P<m{0}>\d\d))?(?::\d\d)?\s*(?P<half{0}>[ap]?)\.?(?:m\b)?\.?"
 _TOKEN = re.compile(
-    rf"\b(?P<days>(?P<first>{_DAY})\s*(?:-|–|to|thru)\s*(?P<last>{_DAY})|daily|nightly|everyday|weekdays|weekends"
-    rf"|(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*)\b|(?P<time>(?<![\w.:]){_TIME.format(0)}\s*(?:-|–|to)\s*{_TIME.format(1)}(?![\w:]))"
-    r"|24/7|24 hours|at all times|(?P<word>[a-z/]{2,}|[|;])",
+    rf"\b(?P<first>{_DAY})\s*(?:-|–|to|thru)\s*(?P<last>{_DAY})\b|\b(?P<day>(?:{'|'.join(_DAYS)})[a-z]*)\b"
+    r"|(?P<all>\b(?:daily|nightly|everyday|all days|weekdays|weekends)\b)"
+    rf"|(?P<time>(?<![\w.:]){_TIME.format(0)}\s*(?:-|–|to)\s*{_TIME.format(1)}(?![\w:]))"
+    r"|(?P<break>[|;])|(?P<word>[a-z/]{2,})",
     re.I,
 )
-_NAMED = {"weekdays": range(5), "weekends": range(5, 7)}
 
 
-class Clause(NamedTuple):
-    label: str  # words before its hours
-    minutes: BoolArray  # (10080,)
-    is_timed: bool  # whether the text says hours or days
-
-
-def clauses_of(text: str) -> list[Clause]:
-    """Return the clauses of a text with hours, each with its words; see the module."""
-    clauses, label, tokens, before = list[Clause](), "", list[tuple[bool, list[int]]](), list(range(7))
+def clauses_of(text: str) -> Iterator[tuple[str, BoolArray, bool]]:
+    """Yield the clauses of a text: the words before its hours, their minutes, (10080,), and whether it has any."""
+    clauses: list[tuple[list[str], list[list[int] | tuple[int, int]]]] = [([], [])]
     end = 0
-
-    def close() -> None:
-        nonlocal before
-        if label.strip(" |;,") or tokens:
-            minutes, before = _week(tokens, before)
-            clauses.append(Clause(label.strip(" |;,"), minutes, bool(tokens)))
-
     for match in _TOKEN.finditer(text):
-        is_hours = match["word"] is None
-        if not is_hours and (tokens or match["word"] in "|;"):
-            close()
-            label, tokens, end = "", [], match.start()
+        is_hours = match["word"] is None and match["break"] is None
+        if match["break"] or (match["word"] and clauses[-1][1]):
+            clauses.append(([], []))
+        words, hours = clauses[-1]
+        if not hours and not match["break"]:
+            words.append(text[end : match.start() if is_hours else match.end()])
         if is_hours:
-            label += text[end : match.start()] if not tokens else ""
-            end = match.end()
-            if match["days"]:
-                tokens.append((True, _days(match)))
-            elif match["time"]:
-                tokens.append((False, _span(match)))
-            else:
-                tokens += [(True, list(range(7)))]
-    if not tokens:
-        label += text[end:]
-    close()
-    return clauses
+            hours.append(_span(match) if match["time"] else _days(match))
+        end = match.end()
+    if not clauses[-1][1]:
+        clauses[-1][0].append(text[end:])
+    before = list(range(7))
+    for words, hours in clauses:
+        minutes, days, spans = ~always() if hours else always(), list[int](), list[tuple[int, int]]()
+        for part in (*hours, None):
+            # A list of days and a list of times, in any order, belong together.
+            if part is None or (type(part) is type(hours[0]) and days and spans):
+                before = days or before
+                _open(minutes, before, spans or [(0, 1440)] * bool(hours))
+                days, spans = [], []
+            if isinstance(part, list):
+                days = days + part
+            elif part is not None:
+                spans.append(part)
+        if "".join(words).strip() or hours:
+            yield "".join(words), minutes, bool(hours)
 
 
 def _days(match: re.Match[str]) -> list[int]:
-    if match["first"] is None:
-        name = match["days"].lower()
-        return list(_NAMED.get(name, range(7))) if name[:3] not in _SPELLED.split() else [_day(name, 5)]
-    first, last = _day(match["first"], 5), _day(match["last"], 6 if match["first"].lower() == "s" else 5)
-    return [(first + k) % 7 for k in range((last - first) % 7 + 1)]
+    if match["all"]:
+        return list({"weekdays": range(5), "weekends": range(5, 7)}.get(match["all"].lower(), range(7)))
+    ends = [(match["first"] or match["day"])[:3].lower(), (match["last"] or match["day"])[:3].lower()]
+    # A single S is Saturday; the second one of `S-S` is Sunday.
+    ends = ["sat" if name == "s" and not (k and ends[0] == "s") else name for k, name in enumerate(ends)]
+    first, last = (next(k for k, day in enumerate(_DAYS[::-1]) if day.startswith(name)) for name in ends)
+    return [(6 - first + k) % 7 for k in range((first - last) % 7 + 1)]
 
 
-def _day(name: str, of_s: int) -> int:
-    """Return the day of a name; a single S is Saturday, or Sunday at the end of `S-S`."""
-    return of_s if name.lower() == "s" else next(k for k, day in enumerate(_SPELLED.split()) if day.startswith(name.lower()[:3]))
-
-
-def _span(match: re.Match[str]) -> list[int]:
+def _span(match: re.Match[str]) -> tuple[int, int]:
     """Return begin and end of a time, minutes of a day; one across midnight ends after 1440."""
-    h0, m0, half0, h1, m1, half1 = (match[key] for key in ("h0", "m0", "half0", "h1", "m1", "half1"))
-    begin, end = 60 * int(h0) + int(m0 or 0), 60 * int(h1) + int(m1 or 0)
-    if half0 or half1:
-        noon, is_pm = 12 * 60, half1.lower() == "p"
-        if half1:
-            end = end % noon + noon * is_pm
-        if not half0:  # the same half of the day, if the time then rises
-            half0 = "p" if is_pm == (begin % noon < end % noon) else "a"
-        begin = begin % noon + noon * (half0.lower() == "p")
-    elif end <= begin and max(begin, end) < 12 * 60:
-        end += 12 * 60
+    begin, end = (60 * int(match[f"h{k}"]) + int(match[f"m{k}"] or 0) for k in (0, 1))
+    halves, noon = [match[f"half{k}"].lower() for k in (0, 1)], 12 * 60
+    if halves[1] and not halves[0]:
+        # Both are in one half of the day if times then rise.
+        halves[0] = halves[1] if begin % noon < end % noon else {"a": "p", "p": "a"}[halves[1]]
+    if halves[0]:
+        begin = begin % noon + noon * (halves[0] == "p")
+    if halves[1]:
+        end = end % noon + noon * (halves[1] == "p")
+    elif end <= begin < noon and not halves[0]:
+        end += noon
     end += end % 60 == 59  # 23:59 is the end of the day
-    return [min(begin, 1440), end if end > begin else end + 1440]
+    return begin, end if end > begin else end + 1440
 
 
-def _week(tokens: Sequence[tuple[bool, list[int]]], before: list[int]) -> tuple[BoolArray, list[int]]:
-    """Return the minutes of times and days in order, (10080,), and the days of the last time."""
-    week, days, spans = ~always(), list[int](), list[list[int]]()
-    if not tokens:
-        return always(), list(range(7))
-    days_first, after_time = tokens[0][0], False
-    for is_days, values in tokens:
-        if is_days:
-            days = (days if days_first and not after_time else []) + values
-            if not days_first:
-                _open(week, days, spans)
-                spans = []
-        else:
-            spans.append(values)
-            if days_first:
-                _open(week, days, [values])
-        after_time = not is_days
-    if spans and not days_first:
-        days = days or before
-        _open(week, days, spans)
-    elif days_first and all(is_days for is_days, _ in tokens):
-        _open(week, days, [[0, 1440]])
-    return week, days
-
-
-def _open(week: BoolArray, days: Sequence[int], spans: Sequence[Sequence[int]]) -> None:
-    for begin, end in spans:
-        for day in days:
+def _open(week: BoolArray, days: Sequence[int], spans: Sequence[tuple[int, int]]) -> None:
+    for day in days:
+        for begin, end in spans:
             week[(1440 * day + np.arange(begin, end)) % len(week)] = True
 
 
-def _minutes_of_columns(rule: Mapping[str, str]) -> BoolArray | None:
-    """Return the minutes of a rule whose days (0 or 7: Sunday) and times have columns; None without them."""
+def _clauses(rule: Mapping[str, str]) -> list[tuple[str, BoolArray, bool]]:
+    """Return the clauses of a rule: of its words, or of columns of days (0 or 7: Sunday) and times."""
     if "start" not in rule and "from_day" not in rule:
-        return None
-    days = list(range(7))
-    if re.fullmatch("[0-7]", rule.get("from_day", "")) and re.fullmatch("[0-7]", rule.get("to_day", "")):
-        first, last = (int(rule[key]) - 1 for key in ("from_day", "to_day"))
+        return list(clauses_of(rule.get("hours") or rule.get("days") or rule.get("class", "")))
+    days, minutes = list(range(7)), ~always()
+    if all(re.fullmatch("[0-7]", rule.get(part, "")) for part in ("from_day", "to_day")):
+        first, last = (int(rule[part]) - 1 for part in ("from_day", "to_day"))
         days = [(first + k) % 7 for k in range((last - first) % 7 + 1)]
-    elif spelled := clauses_of(rule.get("days", "")):
-        days = np.flatnonzero(spelled[0].minutes.reshape(7, 1440).any(axis=1)).tolist()
+    elif match := _TOKEN.match(rule.get("days", "")):
+        days = days if match["word"] else _days(match)
     time = _TOKEN.fullmatch(f"{rule.get('start', '0:00')}-{rule.get('end', '24:00')}")
-    week = ~always()
-    _open(week, days, [_span(time)] if time is not None and time["time"] else [[0, 1440]])
-    return week
+    _open(minutes, days, [_span(time)] if time and time["time"] else [(0, 1440)])
+    return [("", minutes, True)]
 
 
 def _has(words: str, text: str) -> bool:
@@ -162,93 +127,89 @@ def _has(words: str, text: str) -> bool:
 
 
 def _stay(text: str) -> float | None:
-    """Return a longest stay, s: `2P`, `1/4P`, `15MIN`, `2HR`, minutes; None if there is none in it."""
-    if match := _LIMIT.search(text):
-        return 3600.0 * (float(match[1]) / max(float(match[2]), 1.0) if match[1] else float(match[3]))
-    if match := _STAY.search(text):
-        return duration(match[0])
-    return duration(text)
+    """Return a longest stay, s: `2P`, `1/4P`, `15MIN`, `2HR`, a number of minutes; None if there is none in it."""
+    match = _STAY.search(text)
+    if match is None:
+        return duration(text)
+    if match["half"]:
+        return HOUR_S / int(match["half"][2:] or 1)
+    return HOUR_S * float(match["hours"]) if match["hours"] else duration(match[0])
 
 
-def _price(text: str) -> tuple[str, str]:
-    """Return OpenStreetMap's charge of a price in words, and what is assumed if they say more than one."""
-    text = re.sub(r"\s+", " ", text.replace("\\", "/"))
+def _charge(text: str) -> tuple[str, str]:
+    """Return a price in OpenStreetMap's notation, and what is assumed of one that has several."""
+    text = text.replace("\\", "/")
     amounts = [float(amount) for amount in re.findall(r"\d+(?:\.\d+)?", text)]
     if "/" in text or " per " in text or not amounts:
-        return re.split(r" - |;", text)[0], "the first price" if len(amounts) > 1 and re.search(" - |;", text) else ""
-    middle = (min(amounts) + max(amounts)) / 2.0
-    return f"{middle:g}/h", "the middle, as the hours of each price are not given" if len(set(amounts)) > 1 else ""
+        first, *more = re.split(r"\s-\s|;", text)
+        return first, "the first price" if more else ""
+    middle = f"{(min(amounts) + max(amounts)) / 2:g}/h"
+    return middle, "the middle, as the hours of each price are not given" if len(set(amounts)) > 1 else ""
 
 
 @lru_cache(maxsize=65536)
-def tags_of(rules: tuple[Rule, ...]) -> tuple[dict[str, str], tuple[Unread, ...]]:
-    """Return OpenStreetMap's tags of the rules of a bay, and what of their words is not read."""
-    unread = list[Unread]()
-    open_to: dict[str, BoolArray] = defaultdict(lambda: ~always())
-    fees: dict[str, BoolArray] = defaultdict(lambda: ~always())
-    stays: dict[float, BoolArray] = defaultdict(lambda: ~always())
+def tags_of(rules: tuple[Rule, ...]) -> tuple[dict[str, str], tuple[tuple[str, str, str], ...]]:
+    """Return OpenStreetMap's tags of the rules of a bay; and what is not read: part, text and what is assumed."""
+    unread = list[tuple[str, str, str]]()
     closed = list[BoolArray]()
+    access, fees, stays = (defaultdict[str, BoolArray](lambda: ~always()) for _ in range(3))
     for rule in map(dict, rules):
-        kind = rule.get("class", "")
-        minutes = _minutes_of_columns(rule)
-        text = " ".join(rule[key] for key in ("days", "hours") if key in rule)
-        parts = clauses_of(text or ("" if minutes is not None else kind)) if minutes is None else [Clause("", minutes, True)]
-        if text and minutes is None and not any(part.is_timed for part in parts) and re.search(r"\d", text):
-            unread.append(Unread("hours", text, 1, "at all hours"))
-        for label, when, _ in parts or [Clause("", always(), False)]:
-            words = f"{label} {kind}"
-            users = next((users for users, own in USERS.items() if _has(own, words)), "yes")
-            if users == "yes" and kind and not (_has(_OPEN, words) or _stay(kind) or _has(_PAID, words)):
-                unread.append(Unread("class", kind, 1, "open to everybody"))
-            if users != "no":
-                stay = _stay(rule["limit"]) if "limit" in rule else _stay(words)
-                if "limit" in rule and stay is None:
-                    unread.append(Unread("limit", rule["limit"], 1, "no limit of stays"))
-                if stay and stay < 86_400.0:
-                    stays[stay] |= when
-                if "rate" in rule or _has(_PAID, words):
-                    charge, doubt = _price(rule["rate"]) if "rate" in rule else ("", "")
-                    fees[charge] |= when
-                    unread += [Unread("rate", rule["rate"], 1, doubt)] if doubt else []
-                open_to[users] |= when
-            else:
+        kind, clauses = rule.get("class", ""), _clauses(rule) or [("", always(), False)]
+        if (
+            rule.get("hours")
+            and not any(is_timed for _, _, is_timed in clauses)
+            and re.search(r"\d", rule["hours"])
+        ):
+            unread.append(("hours", rule["hours"], "at all hours"))
+        limit, (charge, doubt) = _stay(rule.get("limit", kind)), _charge(rule.get("rate", ""))
+        for part, assumed in (("rate", doubt), ("limit", "" if limit else "no limit of stays")):
+            unread += [(part, rule[part], assumed)] if assumed and part in rule else []
+        if rule.get("disabled_limit", "0") != "0":
+            unread.append(("disabled_limit", rule["disabled_limit"], "the limit of other drivers"))
+        for words, when, _ in clauses:
+            users = next((users for users, known in USERS.items() if _has(known, f"{words} {kind}")), "")
+            if kind and not users and not limit:
+                unread.append(("class", kind, "open to everybody"))
+            if users == "no":
                 closed.append(when)
-        if rule.get("disabled_limit", "0") not in ("0", ""):
-            unread.append(Unread("disabled_limit", rule["disabled_limit"], 1, "the limit of other drivers"))
+                continue
+            access[users] |= when
+            stay = limit or (_stay(words) if words.strip() else None)
+            if stay and stay < DAY_S:
+                stays[f"{stay / 60:g} min"] |= when
+            if "rate" in rule or _has(_PAID, f"{words} {kind}"):
+                fees[charge] |= when
     paid = np.any([~always(), *fees.values()], axis=0)
     for when in closed:
         if paid.any() and not (paid & ~when).any():
             # What forbids all that is sold is no rule of these hours.
-            unread.append(Unread("hours", rules_text(rules), 1, "parking where it is charged"))
+            unread.append(("hours", rules_text(rules), "parking where it is charged"))
         else:
-            open_to["no"] |= when
-    reserved = np.any([~always(), *(when for users, when in open_to.items() if users != "yes")], axis=0)
+            access["no"] |= when
+    reserved = np.any(
+        [~always(), *(when for users, when in access.items() if users not in ("", "yes"))], axis=0
+    )
     if not reserved.all():
         # Prices and limits of those for whom the bay is reserved are not those of all others.
-        for when in (*fees.values(), *stays.values()):
+        for when in (paid, *fees.values(), *stays.values()):
             when &= ~reserved
-        paid &= ~reserved
-    tags = dict(
-        pair for pair in (
-            _tag("access", {users: when for users, when in open_to.items() if users != "yes"}),
-            _tag("fee", {"yes": paid}),
-            _tag("charge", {charge: when for charge, when in fees.items() if charge}),
-            _tag("maxstay", {f"{stay / 60:g} min": when for stay, when in stays.items()}),
-        ) if pair is not None
-    )  # fmt: skip
-    return tags, tuple(unread)
+    by_key = {"access": access, "fee": {"yes": paid}, "charge": fees, "maxstay": stays}
+    return dict(pair for key, values in by_key.items() for pair in _tags(key, values)), tuple(unread)
 
 
 def rules_text(rules: Sequence[Rule]) -> str:
-    return "; ".join(dict.fromkeys(text for rule in rules for _, text in rule))
+    """Return the words of rules, without columns of days and times."""
+    words = (
+        " ".join(text for part, text in rule if part in ("limit", "rate", "hours", "class")) for rule in rules
+    )
+    return " | ".join(dict.fromkeys(words))
 
 
-def _tag(key: str, values: Mapping[str, BoolArray]) -> tuple[str, str] | None:
-    """Return a key and its value at some hours, (10080,) each, or at all; None if it has none."""
-    used = {value: when for value, when in values.items() if when.any()}
-    if not used:
-        return None
-    if len(used) == 1 and next(iter(used.values())).all():
-        return key, next(iter(used))
-    texts = (f"{value} @ ({hours_text(when) or '24/7'})" for value, when in used.items())
-    return f"{key}:conditional", "; ".join(texts)
+def _tags(key: str, values: Mapping[str, BoolArray]) -> Iterator[tuple[str, str]]:
+    """Yield the tag of a key with values at some hours, (10080,) each, or at all."""
+    used = {value: when for value, when in values.items() if value not in ("", "yes") or key == "fee"}
+    texts = [f"{value} @ ({hours_text(when) or '24/7'})" for value, when in used.items() if when.any()]
+    if len(used) == 1 and texts and next(iter(used.values())).all():
+        yield key, next(iter(used))
+    elif texts:
+        yield f"{key}:conditional", "; ".join(texts)

@@ -26,6 +26,7 @@ import shapely
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, with_extra
+from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json, require_file, unpacked_path
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.formats.geojson import Positions
@@ -452,8 +453,21 @@ def _map_of_geojson(features: list[Any], positions: Positions) -> OsmMap:
     pairs = [(e, _preference(f, e)) for e, f in zip(elements, features, strict=True) if e is not None]
     if _holds_outlines(features):
         tags = {"amenity": "parking_space"}
-        return OsmMap([replace(element, tags=tags) for element, _ in pairs], positions)
+        given = [_given_id(feature) for e, feature in zip(elements, features, strict=True) if e is not None]
+        is_id = len(set(given)) == len(given) and all(name and is_plain(name) for name in given)
+        names = given if is_id else [element.id for element, _ in pairs]
+        outlines = zip(pairs, names, strict=True)
+        return OsmMap([replace(element, id=name, tags=tags) for (element, _), name in outlines], positions)
     return OsmMap(_parted_levels(_each_once(pairs)), positions)
+
+
+def _given_id(feature: dict[str, Any]) -> str:
+    """Return the id of an outline to the letter, of whatever form; empty text if it has none."""
+    properties = feature.get("properties") or {}
+    if name := id_of_feature(feature, properties):
+        return name
+    values = (properties.get("bay_id"), properties.get("id"), feature.get("id"))
+    return next((str(value) for value in values if isinstance(value, str | int)), "")
 
 
 _Preference = tuple[bool, int, int]

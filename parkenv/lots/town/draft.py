@@ -27,8 +27,8 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, with_extra
 from parkenv.files.file_names import is_plain
-from parkenv.lots.bays.kerbs import has_kerbs, kerb_slots_of, with_streets_of
-from parkenv.lots.bays.register import Register, Rule, read_bays
+from parkenv.lots.bays.kerbs import kerb_slots_of
+from parkenv.lots.bays.register import Box, Register, Rule, read_bays
 from parkenv.lots.bays.rules import rules_text, tags_of
 from parkenv.lots.draft import UNREACHED, LeftOut, LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots, nearest_on_lanes
@@ -52,8 +52,8 @@ from parkenv.lots.osm.parking import (
     is_space,
     without_overlaps,
 )
-from parkenv.lots.osm.roads import Rank, Turns, count_in, off_the_ground, turns_of
-from parkenv.lots.town.streets import read_streets
+from parkenv.lots.osm.roads import Rank, Road, Turns, count_in, off_the_ground, turns_of
+from parkenv.lots.town.streets import BEYOND, read_streets
 from parkenv.lots.town.supply import (
     CLASS_RULE,
     GARAGES,
@@ -80,7 +80,10 @@ from parkenv.world.lot import Lane
 from parkenv.world.tariff import PUBLIC
 
 ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
-AROUND_BAYS = 300.0  # m, from the bays of a register within which its map is read
+AROUND_BAYS = (
+    0.003  # degrees of latitude, some 300 m, around the bays of a register, in which its map is read
+)
+SERVICE_BEYOND = 12.0  # m, from all streets beyond which bays of a register may be at a service road
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
@@ -131,8 +134,9 @@ def import_town(
     """Draft a town from an OpenStreetMap file; see the module for the rules.
 
     Names and capacities of a list of car parks win; `listed_only` leaves out other parking and streets on no shortest
-    way to them. A register of `bays` (`parkenv.lots.bays.register`) is in place of the map's kerbs, and with `bays_only`
-    of its car parks, too; without bounds, the map is cut `AROUND_BAYS` from its bays. The map is cut at `bounds`, two pairs of latitude and longitude; `untagged_kerbs` multiplies places.
+    way to them. A register of `bays` is in place of the map's kerbs, and with `bays_only` of its car parks, too; its
+    map is that around the bays. The map is cut at `bounds`, two pairs of latitude and longitude; `untagged_kerbs`
+    multiplies places.
     """
     path = Path(path)
     listed = [] if car_parks is None else read_listed(Path(car_parks))
@@ -140,17 +144,16 @@ def import_town(
         place = read_map(path)
         register = None if bays is None else read_bays(bays, columns)
         if register is not None:
-            place, register = _around_bays(place, register, bounds, bays_only)
+            place, register = around_bays(place, register, bounds, whole=not bays_only)
         elif bounds is not None:
             place = place.within(bounds)
         town = _TownImport(place_name(path), place, left_hand)
         if not bays_only:
             town.read_drawn()
-        if register is not None:
-            with naming(bays):
-                town.use_bays(register)
-        else:
+        if register is None:
             town.read_kerbs(untagged_kerbs)
+        else:
+            town.use_bays(register)
         if not bays_only:
             town.read_counted()
         if listed:
@@ -158,38 +161,9 @@ def import_town(
         if listed_only:
             town.rows = [row for row in town.rows if row.capacity_from == "list"]
             town.beside = np.array([row.xy for row in town.rows]).reshape(-1, 2)
-        whole = town.draft()
-    notes = (*unread.rows, *(Unread(*key[:2], n, key[2]) for key, n in town.unread.items()))
-    return replace(whole, draft=replace(whole.draft, unread=notes))
-
-
-def _around_bays(
-    place: OsmMap,
-    register: Register,
-    bounds: tuple[tuple[float, float], tuple[float, float]] | None,
-    bays_only: bool,
-) -> tuple[OsmMap, Register]:
-    """Return the part of a map around the bays of a register, or within bounds, and the bays there."""
-    if not register.ids:
-        raise InputError(f"no bay of the register can be used: {'; '.join(map(str, LeftOut.by_reason(register.left_out)))}")
-    if bounds is not None:
-        register = register.within(*np.min(bounds, axis=0).tolist(), *np.max(bounds, axis=0).tolist())
-        if not register.ids:
-            raise InputError(f"no bay of the register lies within {bounds[0]} to {bounds[1]}")
-    try:
-        place = place.within(register.box(AROUND_BAYS) if bounds is None else bounds)
-    except InputError as error:
-        raise InputError(f"{error}: {no_streets(register)}") from error
-    return replace(place, elements=with_streets_of(register, place.elements)) if bays_only else place, register
-
-
-def no_streets(register: Register) -> str:
-    """Say how to get the streets of a register."""
-    box = ",".join(f"{degrees:.5f}" for corner in register.box(AROUND_BAYS) for degrees in corner)
-    return (
-        f"want the streets of {box} (south, west, north, east), by overpass-turbo.eu: way[highway]({box});(._;>;);out; or "
-        "from download.geofabrik.de or extract.bbbike.org; examples/streets_of_bays.py makes some of the bays alone"
-    )
+        draft = town.draft()
+    notes = (Unread(part, text, n, assumed) for (part, text, assumed), n in town.unread.items())
+    return replace(draft, draft=replace(draft.draft, unread=(*unread.rows, *notes)))
 
 
 class _TownImport(MapImport):
@@ -217,10 +191,10 @@ class _TownImport(MapImport):
         self.names: set[str] = set()
         self.used: set[int] = set()  # parking areas whose places are slots
         self.beside: FloatArray | None = None  # what is near these attracts, if not everything does
-        self.unread: Counter[tuple[str, str, str]] = Counter()  # of the rules of a register: part, text, assumed
-        self.bays = frozenset[str]()  # ids of the slots of a register
-        self.bay_reasons = {NO_AISLE, UNREACHED}  # why bays of a register are left out
-        self.bays_found: list[str] = []
+        self.unread: Counter[tuple[str, str, str]] = Counter()  # of rules of bays: part, text, assumed
+        self.n_bays = 0  # of a register, with those left out
+        self.bays_left_out: tuple[LeftOut, ...] = ()
+        self.bays_found: tuple[str, ...] = ()
         self.listed: list[str] = []  # which facilities car parks of a list are
 
     def _is_open(self, element: OsmElement) -> bool:
@@ -327,39 +301,35 @@ class _TownImport(MapImport):
 
     def use_bays(self, register: Register) -> None:
         """Add the bays of a register as slots at the kerbs of streets, a facility for each side of a way."""
-        roads = [road for road in self.roads if has_kerbs(road)]
-        kerbs = kerb_slots_of(register, roads, self.frame) if roads else None
-        if kerbs is None or not len(kerbs.slots):
-            why = "; ".join(map(str, LeftOut.by_reason(kerbs.left_out if kerbs else {})))
+        closed = np.array([tags_of(own)[0].get("access") == "no" for own in register.rules], bool)
+        register = register.part(~closed, "bays where no car may park at any hour")
+        roads = [road for road in self.roads if _has_kerbs(road)]
+        kerbs = kerb_slots_of(register, roads, self.frame)
+        self.bays_left_out = (*LeftOut.by_reason(register.left_out), *kerbs.left_out)
+        if not kerbs.ids:
+            why = "; ".join(map(str, self.bays_left_out))
             raise InputError(f"no bay stands at a street of the map ({why}); {no_streets(register)}")
-        for reason, ids in (*register.left_out.items(), *kerbs.left_out.items()):
-            self.left_out[reason] += ids
-            self.bay_reasons.add(reason)
-        n_out = sum(map(len, (*register.left_out.values(), *kerbs.left_out.values())))
-        self.bays, self.n_bays = frozenset(kerbs.ids), len(kerbs.ids) + n_out
-        self.bays_found = list(register.found)
+        self.n_bays = len(kerbs.ids) + sum(len(left.ids) for left in self.bays_left_out)
+        self.bays_found = register.found
         rules: dict[tuple[Rule, ...], Rules] = {}
-        for own, count in Counter(register.rules[i] for i in kerbs.bay.tolist()).items():
+        for own, count in Counter(register.rules[kerbs.bay].tolist()).items():
             tags, notes = tags_of(own)
             with unread_table() as unread:
                 rules[own] = rules_of(tags)
-            for note in notes:
-                self.unread[note.tag, note.value, note.assumed] += count
+            for part, text, assumed in notes:
+                self.unread[part, text, assumed] += count
             for note in unread.rows:
                 self.unread[note.tag.removesuffix(":conditional"), rules_text(own), note.assumed] += count
-        rows: dict[str, list[int]] = defaultdict(list)
-        street: dict[str, str] = {}
+        rows: dict[tuple[str, str], list[int]] = defaultdict(list)
         for i, (k, is_left) in enumerate(zip(kerbs.road.tolist(), kerbs.is_left.tolist(), strict=True)):
-            element = f"{roads[k].id} {roads[k].side_of_way('left' if is_left else 'right')}"
-            rows[element].append(i)
-            street[element] = roads[k].tags.get("name", "")
-        for element, index in rows.items():
-            own_rules = [rules[register.rules[b]] for b in kerbs.bay[index].tolist()]
+            side = roads[k].side_of_way("left" if is_left else "right")
+            rows[f"{roads[k].id} {side}", roads[k].tags.get("name", "")].append(i)
+        for (element, street), index in rows.items():
+            own_rules = [rules[own] for own in register.rules[kerbs.bay[index]].tolist()]
+            name = self._named({"name": f"{street} ({element})" if street else ""}, element)
             usual = Counter(own_rules).most_common(1)[0][0]
-            named = f"{street[element]} ({element})" if is_plain(street[element]) and street[element] else ""
-            row = FacilityRow(self._named({"name": named}, element), "kerb", usual, "register", "", element)
-            row.slots, row.slot_rules = kerbs.slots[np.array(index)], own_rules
-            row.slot_ids = [kerbs.ids[i] for i in index]
+            slots, ids = kerbs.slots[np.array(index)], [kerbs.ids[i] for i in index]
+            row = FacilityRow(name, "kerb", usual, "register", "", element, None, slots, own_rules, ids)
             self.rows.append(row)
 
     def read_counted(self) -> None:
@@ -522,8 +492,59 @@ class _TownImport(MapImport):
         )
         found = (*_findings(self, rows, draft, along), *turns.found, *self.place.cut_elements())
         guesses = (*_guesses(rows, draft), *((ALONG_STREETS,) if along else ()))
-        bays_out = tuple(left for left in left_out if self.bays and left.reason in self.bay_reasons)
-        return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows, bays_out)
+        lost = (left for left in left_out if self.n_bays and left.reason in (NO_AISLE, UNREACHED))
+        draft = replace(draft, found=found, left_out=left_out, guesses=guesses)
+        return TownDraft(draft, rows, (*self.bays_left_out, *lost))
+
+
+def _has_kerbs(road: Road) -> bool:
+    """Whether bays may stand at a road: not on motorways, in tunnels, and beyond the map."""
+    is_fast = road.tags["highway"] in ("motorway", "motorway_link", "trunk_link")
+    return not is_fast and road.tags.get("tunnel", "no") == "no" and not road.id.startswith(BEYOND)
+
+
+def around_bays(
+    place: OsmMap, register: Register, bounds: Box | None, *, whole: bool
+) -> tuple[OsmMap, Register]:
+    """Return the map within bounds, else around the bays of a register, and the bays there.
+
+    If it is not the whole map, car parks are left out, and service roads but those of bays far from all streets.
+    """
+    register = register if bounds is None else register.within(bounds)
+    if not len(register.ids):
+        raise InputError(f"no bay of the register lies within {bounds}")
+    try:
+        place = place.within(register.box(AROUND_BAYS) if bounds is None else bounds)
+    except InputError as error:
+        raise InputError(f"{error}: {no_streets(register)}") from error
+    if whole:
+        return place, register
+    ways = [e for e in place.elements if "highway" in e.tags and not e.is_node and e.lines]
+    frame = LocalFrame.around(shapely.get_coordinates(shapely.centroid(register.shapes)))
+    lines = np.array(
+        [shapely.MultiLineString([frame.to_xy(line) for line in e.lines]) for e in ways], np.object_
+    )
+    is_service = np.array([e.tags["highway"] == "service" for e in ways], bool)
+    points = shapely.transform(shapely.centroid(register.shapes), frame.to_xy)
+    near = shapely.STRtree(lines[~is_service]).query(points, predicate="dwithin", distance=SERVICE_BEYOND)[0]
+    alone = np.delete(points, np.unique(near))
+    used = shapely.STRtree(lines[is_service]).query_nearest(alone, max_distance=SERVICE_BEYOND)[1]
+    kept = {ways[i].id for i in np.flatnonzero(is_service)[used].tolist()}
+    elements = [
+        e
+        for e in place.elements
+        if e.id in kept or (e.tags.get("highway") != "service" and "parking" not in e.tags.get("amenity", ""))
+    ]
+    return replace(place, elements=elements), register
+
+
+def no_streets(register: Register) -> str:
+    """Say how to get the streets of a register."""
+    box = ",".join(f"{degrees:g}" for corner in register.box(AROUND_BAYS) for degrees in corner)
+    return (
+        f"want the streets of {box} (south, west, north, east): by overpass-turbo.eu, way[highway]({box});(._;>;);out;"
+        " or from download.geofabrik.de or extract.bbbike.org; examples/streets_of_bays.py makes some of bays alone"
+    )
 
 
 def _with_nodes_in_areas(elements: Sequence[OsmElement]) -> tuple[list[OsmElement], list[str]]:
@@ -591,8 +612,8 @@ def _findings(
     yield f"zones: {', '.join(draft.zone_rules)}"
     yield from (f"of the list: {line}" for line in town.listed)
     yield from town.bays_found
-    if town.bays:
-        standing = len(town.bays.intersection(draft.slot_ids))
+    if town.n_bays:
+        standing = sum(row["slots"] for row in rows if row["capacity_from"] == "register")
         yield f"{standing:,} of {town.n_bays:,} bays, {100 * standing / town.n_bays:.0f} %, stand on a street"
     yield f"frame: {town.frame}"
 

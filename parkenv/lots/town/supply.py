@@ -303,9 +303,9 @@ GATE_S = 10.0  # s that the barrier of a garage takes for a car
 INSIDE_S = {"garage": (30.0, 120.0), "lot": (10.0, 30.0)}
 """Seconds from the entry of a counted facility to a space, when it is empty and when it is full."""
 TABLE = ("name", "kind", "capacity", "capacity_from", "rule", "zone", "slots", "tagged", "element")
-"""Columns of the table of facilities: `capacity_from` is tag, drawn, list, register or rule, `rule` which one; `slots` of the
-capacity are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a kerb with its
-side."""
+"""Columns of the table of facilities: `capacity_from` is tag, drawn, list, register or rule, `rule` which one; `slots`
+of the capacity are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a kerb
+with its side."""
 
 
 @dataclass(eq=False)
