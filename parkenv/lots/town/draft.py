@@ -427,11 +427,16 @@ class _TownImport(MapImport):
         slots = Slots.joined(parts)
         mouths = np.concatenate([slots.mouths(), *([row.xy] for row in self.rows if row.xy is not None)])
         entries, traffic = self.streets.entries()
+        is_guess = bool(self.n_bays) and not len(entries)
+        if is_guess:
+            entries, traffic = self.streets.outermost()
         whole, lanes = self.streets.lanes(mouths, entries if self.beside is not None else None)
         # Of some car parks alone, the shortest ways are left, and none around what is forbidden.
         turns = turns_of(self.place, self.frame, whole, lanes) if self.beside is None else Turns((), (), ())
         of = np.repeat(np.arange(len(self.rows)), [len(part) for part in parts])
-        zone = [rules.zone(row.kind).name for row in self.rows for rules in row.slot_rules]
+        named = {pair: "" for row in self.rows for pair in ((row.kind, rules) for rules in row.slot_rules)}
+        named = {(kind, rules): rules.zone(kind).name for kind, rules in named}
+        zone = [named[row.kind, rules] for row in self.rows for rules in row.slot_rules]
         slots = replace(
             slots,
             zone=np.array(zone, np.str_),
@@ -491,7 +496,8 @@ class _TownImport(MapImport):
             *draft.left_out,
         )
         found = (*_findings(self, rows, draft, along), *turns.found, *self.place.cut_elements())
-        guesses = (*_guesses(rows, draft), *((ALONG_STREETS,) if along else ()))
+        guessed = (ALONG_STREETS,) * along + ("entries where the streets reach farthest",) * is_guess
+        guesses = (*_guesses(rows, draft), *guessed)
         lost = (left for left in left_out if self.n_bays and left.reason in (NO_AISLE, UNREACHED))
         draft = replace(draft, found=found, left_out=left_out, guesses=guesses)
         return TownDraft(draft, rows, (*self.bays_left_out, *lost))

@@ -192,6 +192,12 @@ class Streets:
         nodes = sorted(brought)
         return self.node_xy[nodes], np.array([brought[node] for node in nodes])
 
+    def outermost(self) -> tuple[FloatArray, FloatArray]:
+        """Return entries where the connected part reaches farthest, as `entries` does, where no street leaves the map."""
+        xy = self.node_xy[np.unique(self.nodes[self.kept])]
+        farthest = np.unique([*xy.argmin(axis=0), *xy.argmax(axis=0)])
+        return xy[farthest], np.ones(len(farthest))
+
     def lanes(self, mouths: FloatArray, entries: FloatArray | None = None) -> tuple[list[Lane], list[Lane]]:
         """Return the lanes before and after junctions are split: those that lead to the mouths, (n, 2) m.
 
