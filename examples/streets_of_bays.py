@@ -42,7 +42,7 @@ def groups(pairs, n):
 
 
 def rows_of(register, frame):
-    """Return rows of bays, (m, 2, 2) m from end to end, their half depths, m, across, and the names of their streets."""
+    """Return rows of bays, (m, 2, 2) m from end to end, their half depths, m, and the names of their streets."""
     shapes = shapely.transform(register.shapes, frame.to_xy)
     kind, names = shapely.get_type_id(shapes), register.streets.astype(str)
     xy, is_outline = shapely.get_coordinates(shapely.centroid(shapes)), kind == 3
@@ -210,7 +210,7 @@ def main():
     titles = [re.sub(r"^\d+\s+|\s+between\s.*", "", names[k]) for k in nearest]
     write_osm(given.out, parts, titles, frame)
     print(
-        f"{len(register.ids)} bays in {len(rows)} rows, {shapely.length(parts).sum() / 1e3:.1f} km of streets: {given.out}"
+        f"{len(register.ids)} bays in {len(rows)} rows, {shapely.length(parts).sum() / 1e3:.1f} km of streets"
     )
 
 

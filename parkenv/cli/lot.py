@@ -376,7 +376,7 @@ class Import(Command):
                 [{"reason": left.reason, "id": name} for left in bays_out for name in left.ids],
             )
             rows = [{"reason": left.reason, "bays": len(left.ids), "ids": left.shown} for left in bays_out]
-            print_rows(console, f"Bays that are left out, all in {left_out_csv}", rows, columns=_LEFT_OUT)
+            print_rows(console, f"Bays left out, all in {left_out_csv}", rows, columns=_LEFT_OUT)
         if draft.unread or unread_csv.exists():
             write_csv(unread_csv, [field.name for field in fields(Unread)], map(vars, draft.unread))
             console.print(

@@ -61,7 +61,7 @@ class KerbSlots(NamedTuple):
 class _Places(NamedTuple):
     """n places that a register names, in the lot's frame."""
 
-    ids: list[str]
+    ids: NDArray[np.object_]
     bay: IntArray  # (n,) index in the register
     xy: FloatArray  # (n, 2) m, centres of outlines, else places at the kerb
     axis: FloatArray  # (n, 2) unit vectors along kerb lines and the longer sides of outlines; zeros of points
@@ -89,14 +89,9 @@ def _places(register: Register, frame: LocalFrame) -> _Places:
     axis[own] = sides[np.arange(len(sides)), length.argmax(axis=1)]
     size[own] = np.sort(length, axis=1)[:, ::-1]
     axis /= np.maximum(np.hypot(axis[:, 0], axis[:, 1]), 1e-9)[:, None]
-    ids = [
-        f"{name}-{k + 1}" if numbered else name
-        for name, k, numbered in zip(
-            register.ids[bay].tolist(), rank.tolist(), is_line[bay].tolist(), strict=True
-        )
-    ]
-    spacing = np.where(is_line, shapely.length(shapes) / count, np.inf)[bay]
-    return _Places(ids, bay, xy, axis, size, spacing)
+    ids = register.ids[bay]
+    ids[is_line[bay]] += np.char.add("-", (rank[is_line[bay]] + 1).astype(str)).astype(object)
+    return _Places(ids, bay, xy, axis, size, np.where(is_line, shapely.length(shapes) / count, np.inf)[bay])
 
 
 def kerb_slots_of(register: Register, roads: Sequence[Road], frame: LocalFrame) -> KerbSlots:

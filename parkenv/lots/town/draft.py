@@ -80,10 +80,8 @@ from parkenv.world.lot import Lane
 from parkenv.world.tariff import PUBLIC
 
 ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
-AROUND_BAYS = (
-    0.003  # degrees of latitude, some 300 m, around the bays of a register, in which its map is read
-)
-SERVICE_BEYOND = 12.0  # m, from all streets beyond which bays of a register may be at a service road
+AROUND_BAYS = 0.003  # degrees of latitude, some 300 m, around the bays of a register: what is read of a map
+OFF_STREET = ("driveway", "parking_aisle")  # values of `service` of roads without bays at the kerb
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
@@ -141,19 +139,18 @@ def import_town(
     path = Path(path)
     listed = [] if car_parks is None else read_listed(Path(car_parks))
     with unread_table() as unread, naming(path):
-        place = read_map(path)
-        register = None if bays is None else read_bays(bays, columns)
-        if register is not None:
-            place, register = around_bays(place, register, bounds, whole=not bays_only)
-        elif bounds is not None:
-            place = place.within(bounds)
-        town = _TownImport(place_name(path), place, left_hand)
+        place, name = read_map(path), place_name(path)
+        if bays is not None:
+            register = read_bays(bays, columns)
+            town = _around_bays(name, place, register, bounds, left_hand, whole=not bays_only)
+        else:
+            town = _TownImport(name, place if bounds is None else place.within(bounds), left_hand)
         if not bays_only:
             town.read_drawn()
-        if register is None:
-            town.read_kerbs(untagged_kerbs)
+        if bays is not None:
+            town.use_bays(register if bounds is None else register.within(bounds))
         else:
-            town.use_bays(register)
+            town.read_kerbs(untagged_kerbs)
         if not bays_only:
             town.read_counted()
         if listed:
@@ -304,9 +301,11 @@ class _TownImport(MapImport):
         closed = np.array([tags_of(own)[0].get("access") == "no" for own in register.rules], bool)
         register = register.part(~closed, "bays where no car may park at any hour")
         roads = [road for road in self.roads if _has_kerbs(road)]
-        kerbs = kerb_slots_of(register, roads, self.frame)
-        self.bays_left_out = (*LeftOut.by_reason(register.left_out), *kerbs.left_out)
-        if not kerbs.ids:
+        self.bays_left_out = LeftOut.by_reason(register.left_out)
+        if roads and len(register.ids):
+            kerbs = kerb_slots_of(register, roads, self.frame)
+            self.bays_left_out += kerbs.left_out
+        if not (roads and len(register.ids) and kerbs.ids):
             why = "; ".join(map(str, self.bays_left_out))
             raise InputError(f"no bay stands at a street of the map ({why}); {no_streets(register)}")
         self.n_bays = len(kerbs.ids) + sum(len(left.ids) for left in self.bays_left_out)
@@ -442,11 +441,8 @@ class _TownImport(MapImport):
             zone=np.array(zone, np.str_),
             facility=np.array([self.rows[k].name for k in of.tolist()], np.str_),
         )
-        ids = [
-            name
-            for row in self.rows
-            for name in row.slot_ids or [f"{row.element}-{i + 1}" for i in range(len(row.slots))]
-        ]
+        numbered = [[f"{row.element}-{i + 1}" for i in range(len(row.slots))] for row in self.rows]
+        ids = [name for row, names in zip(self.rows, numbered, strict=True) for name in row.slot_ids or names]
         to_lane = nearest_on_lanes(lanes, slots.mouths())[0] - slots.mouths()
         near = np.hypot(*to_lane.T) < SLOT_REACH - 0.01  # a file rounds
         self.left_out[NO_AISLE] += [ids[i] for i in np.flatnonzero(~near).tolist()]
@@ -509,39 +505,20 @@ def _has_kerbs(road: Road) -> bool:
     return not is_fast and road.tags.get("tunnel", "no") == "no" and not road.id.startswith(BEYOND)
 
 
-def around_bays(
-    place: OsmMap, register: Register, bounds: Box | None, *, whole: bool
-) -> tuple[OsmMap, Register]:
-    """Return the map within bounds, else around the bays of a register, and the bays there.
-
-    If it is not the whole map, car parks are left out, and service roads but those of bays far from all streets.
-    """
-    register = register if bounds is None else register.within(bounds)
-    if not len(register.ids):
-        raise InputError(f"no bay of the register lies within {bounds}")
+def _around_bays(
+    name: str, place: OsmMap, register: Register, bounds: Box | None, left_hand: bool, *, whole: bool
+) -> _TownImport:
+    """Begin the import of a map within bounds, else around bays; unless `whole`, without driveways and car parks."""
     try:
         place = place.within(register.box(AROUND_BAYS) if bounds is None else bounds)
+        used = (
+            e.tags.get("service") not in OFF_STREET and "parking" not in e.tags.get("amenity", "")
+            for e in place.elements
+        )
+        elements = [e for e, is_used in zip(place.elements, used, strict=True) if whole or is_used]
+        return _TownImport(name, replace(place, elements=elements), left_hand)
     except InputError as error:
-        raise InputError(f"{error}: {no_streets(register)}") from error
-    if whole:
-        return place, register
-    ways = [e for e in place.elements if "highway" in e.tags and not e.is_node and e.lines]
-    frame = LocalFrame.around(shapely.get_coordinates(shapely.centroid(register.shapes)))
-    lines = np.array(
-        [shapely.MultiLineString([frame.to_xy(line) for line in e.lines]) for e in ways], np.object_
-    )
-    is_service = np.array([e.tags["highway"] == "service" for e in ways], bool)
-    points = shapely.transform(shapely.centroid(register.shapes), frame.to_xy)
-    near = shapely.STRtree(lines[~is_service]).query(points, predicate="dwithin", distance=SERVICE_BEYOND)[0]
-    alone = np.delete(points, np.unique(near))
-    used = shapely.STRtree(lines[is_service]).query_nearest(alone, max_distance=SERVICE_BEYOND)[1]
-    kept = {ways[i].id for i in np.flatnonzero(is_service)[used].tolist()}
-    elements = [
-        e
-        for e in place.elements
-        if e.id in kept or (e.tags.get("highway") != "service" and "parking" not in e.tags.get("amenity", ""))
-    ]
-    return replace(place, elements=elements), register
+        raise InputError(f"{error}; {no_streets(register)}") from error
 
 
 def no_streets(register: Register) -> str:

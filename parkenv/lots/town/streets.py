@@ -193,7 +193,7 @@ class Streets:
         return self.node_xy[nodes], np.array([brought[node] for node in nodes])
 
     def outermost(self) -> tuple[FloatArray, FloatArray]:
-        """Return entries where the connected part reaches farthest, as `entries` does, where no street leaves the map."""
+        """Return entries as `entries` does, where the connected part reaches farthest: no street leaves the map."""
         xy = self.node_xy[np.unique(self.nodes[self.kept])]
         farthest = np.unique([*xy.argmin(axis=0), *xy.argmax(axis=0)])
         return xy[farthest], np.ones(len(farthest))

@@ -43,7 +43,7 @@ _TRIANGLE = np.array([[0.5, 0.0], [-0.5, 0.5], [-0.5, -0.5]])
 SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677")
 AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
 SLOT = "#9db8d2"
-KERB_COLORS = {"tag": "#225588", "drawn": "#4477aa", "rule": "#8fb8d8"}
+KERB_COLORS = {"tag": "#225588", "register": "#225588", "drawn": "#4477aa", "rule": "#8fb8d8"}
 """Colour of a slot by what its capacity is known from."""
 COUNTED_COLORS = {"lot": "#228833", "garage": "#aa3377", "kerb": "#4477aa"}
 STREET = "#8a8a84"
