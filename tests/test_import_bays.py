@@ -45,7 +45,7 @@ def outlines(path, boxes):
         turn = np.radians(angle)
         axis = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * (length / 2, width / 2) @ axis
-        ring = [[lon, lat] for lat, lon in degrees(corners + [x, y])]
+        ring = [[lon, lat] for lat, lon in degrees(np.add(corners, [x, y]))]
         features.append(
             {"properties": {"id": 1000 + k}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
         )
