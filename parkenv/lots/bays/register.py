@@ -73,7 +73,12 @@ class Register:
 
     def within(self, box: Box) -> Self:
         at = shapely.get_coordinates(shapely.centroid(self.shapes))[:, ::-1]
-        return self.part(((at >= np.min(box, axis=0)) & (at <= np.max(box, axis=0))).all(axis=1))
+        inside = ((at >= np.min(box, axis=0)) & (at <= np.max(box, axis=0))).all(axis=1)
+        if not inside.any():
+            raise InputError(
+                f"no bay of the register lies within latitudes and longitudes {box[0]} to {box[1]}"
+            )
+        return self.part(inside)
 
     def box(self, margin: float) -> Box:
         """Return a box around the bays, without those a degree from most others, with a margin, degrees of latitude."""
@@ -97,6 +102,8 @@ def read_bays(path: str | Path, columns: Mapping[str, str] | None = None) -> Reg
     path = Path(path)
     with naming(path):
         records = list(_records(path))
+        if not records:
+            raise InputError("has no bay, want a row or a feature for each")
         names = list(dict.fromkeys(name for _, record, _ in records for name in record))
         own = dict(_usual(tuple(names)))
         for part, text in (columns or {}).items():
@@ -104,7 +111,7 @@ def read_bays(path: str | Path, columns: Mapping[str, str] | None = None) -> Reg
             for name, known in ((part, list(SYNONYMS)), *((name, names) for name in own[part])):
                 if name not in known:
                     raise InputError(f"--columns has {name!r:.40}; {nearest(name, known)}")
-        if not own.keys() & {"line", "lat"} and not any(shape for _, _, shape in records):
+        if not own.keys() & {"line", "lat"} and unpacked_path(path).suffix.lower() == ".csv":
             raise InputError(
                 f"no position in its columns {', '.join(names)[:400]}; want --columns bay=ID,lat=LATITUDE,"
                 "lon=LONGITUDE or line=POSITIONS"
@@ -191,7 +198,7 @@ def _register(records: Sequence[_Record], columns: Mapping[str, list[str]]) -> R
     register = register.part(register.capacity > 0, "kerb lines without a capacity, where no car was counted")
     if not len(register.ids):
         reasons = "; ".join(f"{reason}: {len(ids)}" for reason, ids in register.left_out.items() if ids)
-        raise InputError(f"no bay in it ({reasons or 'it is empty'})")
+        raise InputError(f"no bay in it ({reasons})")
     return register
 
 

@@ -138,16 +138,16 @@ def import_town(
     """
     path = Path(path)
     listed = [] if car_parks is None else read_listed(Path(car_parks))
+    register = None if bays is None else read_bays(bays, columns)
     with unread_table() as unread, naming(path):
         place, name = read_map(path), place_name(path)
-        if bays is not None:
-            register = read_bays(bays, columns)
+        if register is not None:
             town = _around_bays(name, place, register, bounds, left_hand, whole=not bays_only)
         else:
             town = _TownImport(name, place if bounds is None else place.within(bounds), left_hand)
         if not bays_only:
             town.read_drawn()
-        if bays is not None:
+        if register is not None:
             town.use_bays(register if bounds is None else register.within(bounds))
         else:
             town.read_kerbs(untagged_kerbs)
@@ -298,6 +298,7 @@ class _TownImport(MapImport):
 
     def use_bays(self, register: Register) -> None:
         """Add the bays of a register as slots at the kerbs of streets, a facility for each side of a way."""
+        advice = no_streets(register)
         closed = np.array([tags_of(own)[0].get("access") == "no" for own in register.rules], bool)
         register = register.part(~closed, "bays where no car may park at any hour")
         roads = [road for road in self.roads if _has_kerbs(road)]
@@ -306,8 +307,8 @@ class _TownImport(MapImport):
             kerbs = kerb_slots_of(register, roads, self.frame)
             self.bays_left_out += kerbs.left_out
         if not (roads and len(register.ids) and kerbs.ids):
-            why = "; ".join(map(str, self.bays_left_out))
-            raise InputError(f"no bay stands at a street of the map ({why}); {no_streets(register)}")
+            why = "; ".join(map(str, self.bays_left_out)) or "no street for cars"
+            raise InputError(f"no bay stands at a street of the map ({why}); {advice}")
         self.n_bays = len(kerbs.ids) + sum(len(left.ids) for left in self.bays_left_out)
         self.bays_found = register.found
         rules: dict[tuple[Rule, ...], Rules] = {}
@@ -518,7 +519,8 @@ def _around_bays(
         elements = [e for e, is_used in zip(place.elements, used, strict=True) if whole or is_used]
         return _TownImport(name, replace(place, elements=elements), left_hand)
     except InputError as error:
-        raise InputError(f"{error}; {no_streets(register)}") from error
+        swapped = "; are latitudes and longitudes of the bays swapped?"
+        raise InputError(f"{error}; {no_streets(register)}{swapped}") from error
 
 
 def no_streets(register: Register) -> str:
