@@ -177,7 +177,7 @@ def test_logs_and_maps(tmp_path):
         ('lto = "mini"', "unknown key 'lto'; did you mean 'lot'? known: name, lot, goal"),
         ("goal = 0", "lot is missing"),
         ('lot = "nowhere.geojson"', "lot.file is 'nowhere.geojson', want a file; there is none at /"),
-        ('lot = "campsu"', "lot is 'campsu', want a packaged lot (campus, jam, street, mini, town) or a lot file"),
+        ('lot = "campsu"', "lot is 'campsu', want a packaged lot (campus, jam, street, mini, town, kerbs) or a"),
         ('lot = { name = "mini", grid = { rows = 1, columns = 2 } }', "want exactly one of name, file, grid, city"),
         ('lot = "mini"\nspeeds = { v_walk_kmh = -4 }', "speeds.v_walk_kmh is -4, want a number of at least 0.1"),
         ('lot = "mini"\ncosts = { failure_s = nan }', "costs.failure_s is nan, want a finite number"),

@@ -2,9 +2,10 @@
 
 from typing import Literal, get_args
 
-PackagedLot = Literal["campus", "jam", "street", "mini", "town"]
+PackagedLot = Literal["campus", "jam", "street", "mini", "town", "kerbs"]
 PACKAGED_LOTS: tuple[PackagedLot, ...] = get_args(PackagedLot)
 SCENARIO_NAMES = PACKAGED_LOTS  # packaged scenarios; each has a lot of the same name
+SuiteName = Literal["v3", "streets-v1"]  # benchmark suites
 LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")  # suffixes of lot files
 SensorModelName = Literal["perfect", "blind", "laser", "stereo"]
 SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)

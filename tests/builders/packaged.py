@@ -4,6 +4,7 @@ Sizes are in metres. Positions are rounded to a millimetre and angles to a nanor
 depend on the math library.
 """
 
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from parkenv.lots.generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGri
 from parkenv.world.lot import Lane, ParkingLot
 
 PACKAGED = Path(__file__).parents[2] / "parkenv" / "lots" / "packaged"
+STREETS = Path(__file__).parents[2] / "examples" / "streets_v1" / "kerb_lot.py"
 PITCH = BAY_SIZE[1]
 AISLE = 6.0
 EAST, WEST = 0.0, np.pi
@@ -170,7 +172,9 @@ def mini():
     return lot("mini", rows, [([(-9.0, 0.0), (17.0, 0.0)], False)], [(-9.0, 0.0)], [(25.0, 0.0)], walls)
 
 
-LOTS = {make.__name__: make for make in (campus, jam, street, mini, town)}
+LOTS = {
+    make.__name__: make for make in (campus, jam, street, mini, town, runpy.run_path(str(STREETS))["kerbs"])
+}
 
 
 if __name__ == "__main__":
