@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from parkenv.studies.statistics import Estimate, stratified_estimate
+from parkenv.studies.statistics import Estimate, mean_interval, mean_over_days, stratified_estimate
 
 
 def test_one_stratum_is_students_interval_and_two_samples_are_welchs():
@@ -16,6 +16,16 @@ def test_one_stratum_is_students_interval_and_two_samples_are_welchs():
     difference = Estimate.combined([(1.0, its), (-1.0, theirs)])
     welch = stats.ttest_ind(one, other, equal_var=False).confidence_interval()
     assert difference.interval()[1:] == pytest.approx((welch.low, welch.high))
+
+
+def test_searches_of_a_day_count_as_one_where_days_are_equally_many():
+    """Of days with equally many searches, the interval is Student's of the means of the days."""
+    rng = np.random.default_rng(3)
+    searches = rng.normal(0.0, 4.0, (7, 1)) + rng.normal(60.0, 2.0, (7, 20))
+    days = np.repeat([f"2024-01-0{day}" for day in range(1, 8)], 20)
+    known = stats.ttest_1samp(searches.mean(axis=1), 0.0).confidence_interval()
+    assert mean_over_days(searches.ravel(), days) == pytest.approx((searches.mean(), known.low, known.high))
+    assert mean_over_days(searches[0], [""] * 20) == mean_interval(searches[0])
 
 
 def test_a_control_variate_that_says_all_leaves_no_error():

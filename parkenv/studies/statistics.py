@@ -45,6 +45,31 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
     return mean, float(interval.low), float(interval.high)
 
 
+def mean_over_days(values: ArrayLike, days: ArrayLike) -> tuple[float, float, float]:
+    """Compute the mean of searches and its 95 % interval where searches of a recorded day share what happened on it.
+
+    Errors are clustered by day, with Student's t of one degree of freedom less than days (Cameron and Miller, *A
+    practitioner's guide to cluster-robust inference*, 2015). Of a single day, or without days, the searches count as
+    independent; see `mean_interval`.
+
+    Args:
+        values: (n,) numbers.
+        days: (n,) name of the day of each; all empty for worlds that are drawn anew for each search.
+
+    Examples:
+        >>> mean, low, high = mean_over_days([1.0, 1.0, 1.0, 3.0], ["mon", "mon", "mon", "tue"])
+        >>> round(mean, 2), round(high - mean, 2)
+        (1.5, 6.74)
+    """
+    sample, (names, day) = np.asarray(values, np.float64), np.unique(np.asarray(days), return_inverse=True)
+    if len(names) < 2:
+        return mean_interval(sample)
+    mean, count = float(sample.mean()), len(names)
+    sums = np.bincount(day, sample - mean)
+    error = float(np.sqrt(count / (count - 1.0) * (sums**2).sum())) / len(sample)
+    return Estimate(mean, error, count - 1.0).interval()
+
+
 def mean_or_nan(values: NDArray[Any]) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
@@ -200,23 +225,25 @@ def summarize(
 ) -> dict[str, Any]:
     """Return the row of an agent in one setting, which `columns` identify, from its rows of `episodes.csv`.
 
-    Differences are to the rows of the same seeds in `first`; None for the first agent itself.
+    Differences are to the rows of the same seeds in `first`; None for the first agent itself. Intervals of replayed
+    days are by day; see `mean_over_days`.
     """
     total, parked = _column(episodes, "total_s"), _column(episodes, "parked")
+    days = [row.get("day", "") for row in episodes]
     row: dict[str, Any] = {
         **columns,
         "episodes": len(episodes),
         "parked_fraction": float(parked.mean()),
-        **columns_of("total_s", mean_interval(total)),
+        **columns_of("total_s", mean_over_days(total, days)),
         "median_s": float(np.median(total)),
         "gave_up_fraction": float(1.0 - parked.mean()),
         "difference_s": 0.0,
         "difference_s_ci95": [0.0, 0.0],
     }
     if first is not None:
-        row |= columns_of("difference_s", mean_interval(paired_differences(episodes, first)))
+        row |= columns_of("difference_s", mean_over_days(*paired_differences(episodes, first)))
     row |= {name: float(_column(episodes, name).mean()) for name in MEANS}
-    row |= columns_of("regret_s", mean_interval(total - _column(episodes, "bound_s")))
+    row |= columns_of("regret_s", mean_over_days(total - _column(episodes, "bound_s"), days))
     return row | decision_columns(decision_s)
 
 
@@ -233,9 +260,11 @@ def decision_columns(decision_s: ArrayLike) -> dict[str, float]:
 
 def paired_differences(
     episodes: Sequence[Mapping[str, Any]], others: Sequence[Mapping[str, Any]]
-) -> list[float]:
+) -> tuple[list[float], list[str]]:
+    """Return the differences of total times in the same worlds, s, and the recorded day of each."""
     totals = {e["seed"]: e["total_s"] for e in others}
-    return [e["total_s"] - totals[e["seed"]] for e in episodes if e["seed"] in totals]
+    pairs = [(e["total_s"] - totals[e["seed"]], e.get("day", "")) for e in episodes if e["seed"] in totals]
+    return [difference for difference, _ in pairs], [day for _, day in pairs]
 
 
 def _column(episodes: Sequence[Mapping[str, Any]], name: str) -> NDArray[np.float64]:

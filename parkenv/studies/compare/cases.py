@@ -20,7 +20,14 @@ from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s
-from parkenv.studies.statistics import LEAST_PAIRS, columns_of, mean_interval, paired_differences, summarize
+from parkenv.studies.statistics import (
+    LEAST_PAIRS,
+    columns_of,
+    mean_interval,
+    mean_over_days,
+    paired_differences,
+    summarize,
+)
 from parkenv.studies.workers import Workers
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
@@ -249,8 +256,8 @@ def _mark_leaders(agents: Sequence[tuple[Row, list[Row]]]) -> None:
     acting = [agent for agent in agents if agent[0]["agent"] not in UNBEATEN] or agents[:1]
     _, best = min(acting, key=lambda agent: float(agent[0]["total_s"]))
     for row, episodes in agents:
-        behind = paired_differences(episodes, best)
-        shown = len(behind) >= LEAST_PAIRS and mean_interval(behind)[1] > 0.0
+        behind, days = paired_differences(episodes, best)
+        shown = len(behind) >= LEAST_PAIRS and mean_over_days(behind, days)[1] > 0.0
         row["leads"] = row["agent"] not in UNBEATEN and not shown
 
 
