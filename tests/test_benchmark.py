@@ -1,5 +1,7 @@
 """The benchmark suite: results can be checked, and altered ones are rejected."""
 
+import csv
+import itertools
 import json
 from collections import Counter
 from dataclasses import replace
@@ -14,7 +16,7 @@ from parkenv.lots import read_lot
 from parkenv.lots.draft import combined_error_probability, read_provenance
 from parkenv.lots.lot_files import PLACES
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.benchmark.page import Entry, precision
+from parkenv.studies.benchmark.page import Entry, benchmark_data, precision
 from parkenv.studies.benchmark.suite import (
     CONTROLS,
     Stratum,
@@ -27,6 +29,7 @@ from parkenv.studies.benchmark.suite import (
 )
 from parkenv.studies.lots import check_drivability, lot_columns
 from parkenv.studies.results import EPISODES
+from parkenv.studies.statistics import mean_over_days
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival
 
@@ -53,7 +56,7 @@ def result(small):
 
 
 def checked(content, small, path, monkeypatch):
-    monkeypatch.setattr(Suite, "packaged", classmethod(lambda cls: small))
+    monkeypatch.setattr(Suite, "packaged", classmethod(lambda cls, name: small))
     write_result(path, content, "result.json")
     return check_result(path / "result.json")
 
@@ -91,7 +94,7 @@ def times_of(content):
         (lambda c: c["rows"][0].update(decision_ms=0.0), "sha256 is [0-9a-f]{64}, want [0-9a-f]{64}"),
         (lambda c: c["scores"].update({"greedy-goal": 0.99}), "scores.greedy-goal is 0.99, want"),
         (lambda c: c.update(suite_sha256="0" * 64), "suite_sha256 is 0{64}, want "),
-        (lambda c: c.update(suite="v7"), "suite is 'v7', want 'v3'"),
+        (lambda c: c.update(suite="v7"), "suite is 'v7', want 'v3' or 'streets-v1'"),
         (lambda c: c.pop("scores"), "scores is missing"),
     ],
 )
@@ -136,7 +139,7 @@ def test_precision_is_the_error_of_the_mean_difference_by_strata(small):
 
 
 def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, tmp_path, monkeypatch):
-    monkeypatch.setattr(Suite, "packaged", classmethod(lambda cls: small))
+    monkeypatch.setattr(Suite, "packaged", classmethod(lambda cls, name: small))
     other = json.loads(json.dumps(result)) | {"by": "</script><b>", "command": ["parkenv", "run", "a b"]}
     other["sha256"] = fingerprint(other)
     for name, content in (("ours", result), ("other", other)):
@@ -166,22 +169,79 @@ def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, 
     write_result(tmp_path / "other", other | {"suite_sha256": "0" * 64}, "result.json")
     assert "other" in refused(*command)
     assert not page.exists()
+    with pytest.raises(InputError, match="of the suites streets-v1, v3, want those of one"):
+        benchmark_data([result, result | {"suite": "streets-v1"}], ["parkenv"])
 
 
-def test_the_suite_does_not_change_and_is_a_stratified_sample():
-    suite = Suite.packaged()
-    assert suite.fingerprint == "42cb771e4ee99c3b27b33d9500979532c5b9e92b11d9b77010e508998436bc38"
+@pytest.mark.parametrize(
+    ("name", "fingerprint", "tasks", "searches", "smallest"),
+    [
+        ("v3", "42cb771e4ee99c3b27b33d9500979532c5b9e92b11d9b77010e508998436bc38", 12, 3000, "mini"),
+        ("streets-v1", "33e5bc1b62c8fe199d797c8c9816bd6a380971119ff8259e2f40f242755776cf", 11, 1200, "noon"),
+    ],
+)
+def test_a_suite_does_not_change_and_is_a_stratified_sample(name, fingerprint, tasks, searches, smallest):
+    suite = Suite.packaged(name)
+    assert suite.fingerprint == fingerprint
     seeds = [seed for task in suite.tasks for seed in task.seeds]
-    assert (len(suite.tasks), len(set(seeds)), len(seeds)) == (12, 3000, 3000)
+    assert (len(suite.tasks), len(set(seeds)), len(seeds)) == (tasks, searches, searches)
     for task in suite.tasks:
         assert sum(part.share for part in task.strata) == pytest.approx(1.0)
         full = [part.means[CONTROLS.index("occupancy")] for part in task.strata]
         assert full == sorted(full)
     # The strata divide the worlds by their occupancy at arrival.
-    mini = next(task for task in suite.tasks if task.name == "mini")
-    numbers = np.repeat(np.arange(len(mini.strata)), [len(part.seeds) for part in mini.strata])
-    full = worlds_of(mini, suite)[:, CONTROLS.index("occupancy")]
-    assert all(full[numbers == h].max() <= full[numbers == h + 1].min() for h in range(len(mini.strata) - 1))
+    task = next(task for task in suite.tasks if task.name == smallest)
+    numbers = np.repeat(np.arange(len(task.strata)), [len(part.seeds) for part in task.strata])
+    full = worlds_of(task, suite)[:, CONTROLS.index("occupancy")]
+    assert all(full[numbers == h].max() <= full[numbers == h + 1].min() for h in range(len(task.strata) - 1))
+
+
+def test_searches_of_streets_begin_outside_at_their_hours_and_walk_to_their_goals():
+    suite = Suite.packaged("streets-v1")
+    saturday = next(task for task in suite.tasks if task.name == "saturday").made(suite.arrival)
+    full = next(task for task in suite.tasks if task.name == "nearly-full").made(suite.arrival)
+    assert (saturday.arrival.weekdays, saturday.arrival.start_s, saturday.goal) == ((5,), 12 * 3600.0, 18)
+    assert full.occupancy.marginal(19.5 * 3600.0).mean() == pytest.approx(0.96)
+    for scenario in (saturday, full):
+        away = np.hypot(*(scenario.lot.entries - scenario.lot.goals[scenario.goal]).T)
+        assert away.min() > 100.0
+
+
+BEGINNER = """
+class Beginner:
+    def __init__(self, scenario):
+        pass
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return int(observation["action_mask"].nonzero()[0][-1]), state
+"""
+
+
+def test_the_protocol_runs_on_recorded_days_and_says_what_it_leaves_out(tmp_path, monkeypatch):
+    """Six weekdays from 8 to 19 h of the ten slots of `mini`: one goal, so equal hours count once; no Saturday."""
+    lines = ["slot_id,datetime,occupied"]
+    for day, hour, slot in itertools.product(range(11, 19), range(8, 20), range(10)):
+        name = f"A{slot + 1}" if slot < 6 else f"B{slot - 5}"
+        if day not in (16, 17):  # a weekend
+            lines.append(f"{name},2016-01-{day}T{hour:02d}:00:00,{int((slot * 7 + hour * day) % 5 > 1)}")
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    (tmp_path / "real.toml").write_text('lot = "mini"\noccupancy = { log = "log.csv", mapping = "same" }')
+    (tmp_path / "beginner.py").write_text(BEGINNER)
+    monkeypatch.setattr("parkenv.studies.benchmark.suite.SEARCHES_ON", 6)
+    command = (
+        "benchmark run streets-v1 --on real.toml --agents first-free,beginner:Beginner --jobs 1 --out out"
+    )
+    said = ran(command, cwd=tmp_path)
+    assert "task saturday is left out" in said.stderr + said.stdout
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [row["scenario"] for row in summary["tasks"][::2]] == ["morning", "noon", "evening"]
+    assert [(row["scenario"], row["episodes"]) for row in summary["rows"]] == [("real", 18)] * 2
+    with (tmp_path / "out" / "episodes.csv").open() as file:
+        own = [row for row in csv.DictReader(file) if row["agent"] == "first-free"]
+    wanted = mean_over_days([float(row["total_s"]) for row in own], [row["day"] for row in own])
+    assert len({row["day"] for row in own}) > 2
+    assert all(8 * 3600 <= float(row["arrival_s"]) % 86_400 <= 19 * 3600 for row in own)
+    assert summary["rows"][0]["total_s_ci95"] == pytest.approx(wanted[1:], abs=1e-2)
 
 
 def test_the_days_of_the_suite_differ_from_their_forecast():

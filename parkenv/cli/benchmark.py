@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import command_line, make_console, print_rows, print_table
 from parkenv.files.atomic_write import make_folder
+from parkenv.files.known_names import SuiteName
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several
 from parkenv.show.columns import Column, shared
@@ -72,16 +72,16 @@ class Page(Command):
 
 
 class Show(Command):
-    """For each task: scenario, slots, mean occupancy, day error, sensor model and walking speed."""
+    """For each task: scenario, slots, goal, arrival, mean occupancy, day error, sensor model and walking speed."""
 
-    examples = "parkenv benchmark show"
+    examples = "parkenv benchmark show streets-v1"
 
-    suite: Literal["v3"] = option("v3", "The suite.", argument=True)
+    suite: SuiteName = option("v3", "The suite.", argument=True)
 
     def run(self) -> None:
         from parkenv.studies.benchmark.suite import Suite
 
-        suite = Suite.packaged()
+        suite = Suite.packaged(self.suite)
         console = make_console()
         console.print(f"{suite.name}: {suite.description}")
         rows = []
@@ -92,6 +92,8 @@ class Show(Command):
                     "task": task.name,
                     "scenario": task.scenario,
                     "slots": scenario.lot.n_slots,
+                    "goal": scenario.goal,
+                    "arrival": "the suite's" if task.arrival is None else f"{task.days} {task.arrival}",
                     "mean_occupancy": "as it comes" if level is None else f"{level:.0%}",
                     "day_error": ", ".join(f"{size:g}" for size in task.day_error),
                     "sensor_model": task.sensor_model,

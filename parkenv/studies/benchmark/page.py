@@ -108,7 +108,10 @@ def neighbours(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
 
 
 def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, Any]:
-    suite, entries = Suite.packaged(), entries_of(results)
+    names = sorted({result["suite"] for result in results})
+    if len(names) > 1:
+        raise InputError(f"results are of the suites {', '.join(names)}, want those of one on a page")
+    suite, entries = Suite.packaged(results[0]["suite"]), entries_of(results)
     commands = [
         {"agent": ", ".join(result["episodes"]), "command": shlex.join(result["command"])} | _origin(result)
         for result in results

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+from pydantic import Field
+
+from parkenv.files.known_names import SuiteName
 from parkenv.files.limited_reading import read_json
-from parkenv.files.option import option
+from parkenv.files.option import Inside, Option, option
 from parkenv.show.columns import Column, shared
 from parkenv.show.report.tables import spread, table_of
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import CaseStudy
-from parkenv.studies.fields import Agents
+from parkenv.studies.fields import Agents, ScenarioItem, one_word
 from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell
 from parkenv.studies.workers import Task
@@ -40,12 +43,18 @@ def score_table(results: Sequence[Row]) -> Row:
 
 
 class Benchmark(CaseStudy):
-    """The suite defines scenarios, costs, speeds and seeds.
+    """A suite defines scenarios, costs, speeds and seeds.
 
     An agent's score in a task is the mean total time of the clairvoyant bound divided by the agent's own; its score in
-    the suite is the mean over the tasks, at most 1.
+    the suite is the mean over the tasks, at most 1. In a world of your own (`--on`) it is a comparison: means over all
+    searches, and no score.
     """
 
+    table_titles: ClassVar = {"rows": "Results", "tasks": "By task"}
+    shown: ClassVar = {
+        "rows": CaseStudy.shown["rows"],
+        "tasks": ("scenario", "agent", "episodes", "total_s", "difference_s", "regret_s", "parked_fraction"),
+    }
     columns: ClassVar = (
         Column("task", "task", setting=True),
         *shared("agent"),
@@ -55,10 +64,11 @@ class Benchmark(CaseStudy):
     examples: ClassVar = """
         parkenv benchmark run v3 --agents belief,mdp --out results/v3
         parkenv benchmark check results/v3/result.json
+        parkenv benchmark run streets-v1 --on district.toml --agents belief,first-free
         """
 
     kind: Literal["benchmark"] = "benchmark"
-    suite: Literal["v3"] = option("v3", "The suite.", name="SUITE", argument=True)
+    suite: SuiteName = option("v3", "The suite.", name="SUITE", argument=True)
     by: str = option("", "Who submits the result.", default="nobody", max_length=200)
     code: str = option(
         "",
@@ -69,23 +79,34 @@ class Benchmark(CaseStudy):
         max_length=200,
     )
     agents: Agents = tuple(AgentSpec(name=name) for name in AGENTS)
+    on: Annotated[
+        ScenarioItem | None,
+        Field(
+            description="Run the suite's protocol in this world instead, such as recorded kerbs: its hours and goals, "
+            "with intervals by day. A scenario file (.toml) with lot and log, or a lot (.geojson)."
+        ),
+        Option(takes="NAME|FILE", parse=one_word, default="the suite's worlds"),
+        Inside(only=()),
+    ] = None
 
     @cached_property
     def made_suite(self) -> Suite:
         from parkenv.studies.benchmark.suite import Suite
 
-        return Suite.packaged()
+        return Suite.packaged(self.suite)
 
     def check(self) -> None:
         self.cells()
 
     def settings(self) -> Row:
-        from parkenv.studies.results import agent_fingerprints
+        from parkenv.studies.results import agent_fingerprints, fingerprints, flat_tables
 
         return {
             "version": __version__,
             "suite": self.made_suite.name,
             "suite_sha256": self.made_suite.fingerprint,
+            "on": None if self.on is None else flat_tables(self.on.model_dump(mode="json")),
+            "files": fingerprints(self.files()),
             "agent files": agent_fingerprints(agent.name for agent in self.agents),
         }
 
@@ -94,20 +115,27 @@ class Benchmark(CaseStudy):
 
     @cached_property
     def _cases(self) -> list[Cell]:
-        return self.made_suite.cases(self.agents)
+        suite = self.made_suite
+        return suite.cases(self.agents) if self.on is None else suite.cases_on(self.on, self.agents)
 
     def summarise(self, results: Results) -> Row:
-        from parkenv.studies.benchmark.suite import score_rows
+        from parkenv.studies.benchmark.suite import score_rows, world_rows
 
+        if self.on is not None:
+            return world_rows(self.on.title, self.cells(), results.rows(self.table))
         return {"rows": score_rows(self.made_suite, self.cells(), results.rows(self.table))}
 
     @classmethod
     def printed(cls, summary: Row, folder: Path) -> list[Row]:
+        if "tasks" in summary:
+            return super().printed(summary, folder)
         return [score_table([read_json(folder / RESULT)])] if summary["complete"] else []
 
     def outputs(self, result: Result) -> list[Task[object]]:
         from parkenv.studies.benchmark.suite import result_of, write_result
 
+        if self.on is not None:
+            return []
         finished = result.results.rows(self.table)
         command = result.summary["command"]
         content = result_of(self.made_suite, self.cells(), finished, command, self.by, self.code)

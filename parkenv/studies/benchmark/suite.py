@@ -1,13 +1,14 @@
-"""The benchmark suite: fixed scenarios, seeds and metrics that make results of different groups comparable.
+"""Benchmark suites: fixed scenarios, seeds and metrics that make results of different groups comparable.
 
 A suite is a JSON file in the folder `suites`. A published suite never changes; improvements go into a new suite. A
 result file names its suite, contains the total time of every search, and can be checked by anybody.
 
-The searches of `v3` are a stratified sample of a population of 5,000 worlds for each task. Six strata divide it by the
-occupancy at arrival, at shares 0.3, 0.55, 0.75, 0.87 and 0.95 of the population. `mdp`, `mdp-tuned` and `first-free`
-searched in its last 400 worlds; from the standard deviations of their paired differences in each stratum follows how
-many of the 3,000 searches it gets (Neyman 1934), at least 8. The means of the clairvoyant bound and of the occupancy at
-arrival are known for the whole population, and serve as control variates.
+The searches of a suite are a stratified sample of a population of worlds for each task: 5,000 in `v3`, 2,000 in
+`streets-v1`. Six strata divide it by the occupancy at arrival, at shares 0.3, 0.55, 0.75, 0.87 and 0.95 of the
+population. `mdp`, `mdp-tuned` and `first-free` searched in its last 400 worlds (`streets-v1`: 150); from the standard
+deviations of their paired differences in each stratum follows how many of the searches it gets (Neyman 1934; 3,000 and
+1,200 in all), at least 8; `examples/streets_v1/choose_searches.py` chose those of `streets-v1`. The means of the
+clairvoyant bound and of the occupancy at arrival are known for the whole population, and serve as control variates.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ import hashlib
 import json
 import re
 import subprocess
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -29,28 +31,39 @@ from numpy.typing import ArrayLike
 from pydantic import Field, TypeAdapter
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import write_text
 from parkenv.files.field_types import NotNegative, Probability
+from parkenv.files.known_names import SuiteName
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import build, make_scenario
+from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.compare.cases import Case, at_occupancy, require_distinct
+from parkenv.studies.compare.cases import Case, at_occupancy, check_worlds, require_distinct, table
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.results import Key, Row, decision_s, without_nan
-from parkenv.studies.statistics import Estimate, columns_of, decision_columns, stratified_estimate
+from parkenv.studies.results import SETTING_COLUMNS, Key, Row, decision_s, without_nan
+from parkenv.studies.statistics import (
+    Estimate,
+    columns_of,
+    decision_columns,
+    stratified_estimate,
+    summarize,
+)
 from parkenv.studies.study import Cell
 from parkenv.version import __version__
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.process import OccupancyModel
+from parkenv.world.occupancy.recorded import RecordedOccupancy
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from planners.agent import make_agent
 
 # Columns of an episode that its world alone determines: the control variates.
 CONTROLS = ("bound_s", "occupancy")
-_FILE = Path(__file__).parent / "suites" / "v3.json"
+SEARCHES_ON, FIRST_SEED_ON = 250, 9_000_000  # of the protocol in another world: searches of each task
+SUITES = Path(__file__).parent / "suites"
 
 
 @dataclass(frozen=True)
@@ -70,17 +83,25 @@ class Task:
     # `perfect`, or the rig whose fitted sensor model is used; `sight` in the suite's file
     sensor_model: str = "perfect"
     v_walk_kmh: float | None = None  # walking speed; None for the scenario's own
+    goal: int | None = None  # index of the goal in the lot; None for the scenario's own
+    arrival: str | None = None  # HH:MM-HH:MM; None for the suite's
+    days: str = "weekdays"  # of `arrival`
 
     @property
     def seeds(self) -> tuple[int, ...]:
         return tuple(seed for part in self.strata for seed in part.seeds)
 
+    def window(self, of_suite: ArrivalWindow) -> ArrivalWindow:
+        return of_suite if self.arrival is None else ArrivalWindow.parse(self.arrival, self.days)
+
     def made(self, arrival: ArrivalWindow) -> Scenario:
         options: dict[str, Any] = {
             "name": self.name,
-            "arrival": arrival,
+            "arrival": self.window(arrival),
             "day_error": DayError(*self.day_error),
         }
+        if self.goal is not None:
+            options["goal"] = self.goal
         if self.sensor_model != "perfect":
             options["sensor_model"] = SensorModel.named(self.sensor_model)
         if self.v_walk_kmh is not None:
@@ -98,15 +119,15 @@ class Suite:
     fingerprint: str  # SHA-256 of the suite's file, as JSON without white space
 
     @classmethod
-    def packaged(cls) -> Self:
-        """Load the suite.
+    def packaged(cls, name: SuiteName = "v3") -> Self:
+        """Load a suite.
 
         Examples:
             >>> suite = Suite.packaged()
             >>> suite.name, suite.tasks[0].name, sum(len(task.seeds) for task in suite.tasks)
             ('v3', 'campus', 3000)
         """
-        content = read_json(_FILE)
+        content = read_json(SUITES / f"{name}.json")
         fields = [{"sensor_model": task.get("sight", "perfect")} | task for task in content["tasks"]]
         tasks = TypeAdapter(tuple[Task, ...]).validate_python(fields)
         arrival = ArrivalWindow.parse(content["arrival"], content["days"])
@@ -124,6 +145,47 @@ class Suite:
         ]
         require_distinct(case for case, _ in cells)
         return cells
+
+    def cases_on(self, world: ScenarioSpec, agents: Sequence[AgentSpec]) -> list[Cell]:
+        """Return the suite's protocol in another world: its hours and goals, with `SEARCHES_ON` searches each.
+
+        Goal g of a task is goal g of the world's lot, counted around. Tasks that differ in the suite's own world alone
+        count once. Hours before or after those of a log are cut. A task is left out with a warning if no such hour or
+        day is recorded, or a day has no others to forecast it from.
+        """
+        cells, seen, faults = list[Cell](), set[tuple[Any, ArrivalWindow]](), list[str]()
+        n_goals = len(build(world).lot.goals)
+        for number, task in enumerate(self.tasks):
+            window = task.window(self.arrival)
+            goal = world.goal if task.goal is None or isinstance(world.goal, tuple) else task.goal % n_goals
+            if (goal, window) in seen:
+                continue
+            seen.add((goal, window))
+            scenario = build(world.changed(name=task.name, goal=goal))
+            seeds = range(FIRST_SEED_ON + number * SEARCHES_ON, FIRST_SEED_ON + (number + 1) * SEARCHES_ON)
+            try:
+                scenario = scenario.replace(arrival=_recorded_part(window, scenario.occupancy))
+                check_worlds(scenario, seeds)
+            except InputError as error:
+                faults.append(f"task {task.name} is left out: {error}")
+                continue
+            for agent in agents:
+                make_agent(agent.name, scenario, **agent.options)
+                cells.append(Cell(Case(scenario, agent.name, options=agent.options), seeds))
+        require(cells, f"{world.source}: no task can be run; {next(iter(faults), '')}")
+        for fault in faults:
+            warnings.warn(fault, stacklevel=2)
+        require_distinct(case for case, _ in cells)
+        return cells
+
+
+def _recorded_part(window: ArrivalWindow, occupancy: OccupancyModel) -> ArrivalWindow:
+    if not isinstance(occupancy, RecordedOccupancy):
+        return window
+    seconds = occupancy.log.second
+    start, end = max(window.start_s, float(seconds.min())), min(window.end_s, float(seconds.max()))
+    require(start < end, f"{occupancy.log.source}: no observation within its hours")
+    return replace(window, start_s=start, end_s=end)
 
 
 def estimate(task: Task, values: ArrayLike, worlds: FloatArray, *, controls: bool = True) -> Estimate:
@@ -193,7 +255,7 @@ METRICS = tuple(_ResultRow.model_fields)[2:-1]
 class ResultFile(Spec):
     format: Literal["parkenv-benchmark-result"]
     version: Literal[2]
-    suite: Literal["v3"]
+    suite: SuiteName
     suite_sha256: str = Field(pattern="^[0-9a-f]{64}$")
     parkenv: str
     commit: str = Field(max_length=60)
@@ -229,6 +291,20 @@ def score_rows(
         metrics = {name: row.get(name) for name in (*METRICS, "score")}
         rows.append({"task": task.name, "agent": case.label, **metrics})
     return rows
+
+
+def world_rows(name: str, cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]) -> Row:
+    """Return the tables of the protocol in another world: `rows` over all tasks, and `tasks` one by one."""
+    tasks, searches = table(cells, finished), dict[str, list[Row]]()
+    for search in finished.values():
+        searches.setdefault(search["agent"], []).append(search)
+    first, rows = searches[tasks[0]["agent"]] if tasks else None, list[Row]()
+    for columns in {row["agent"]: row for row in tasks}.values():
+        own = searches[columns["agent"]]
+        columns = {key: columns[key] for key in SETTING_COLUMNS} | {"scenario": name}
+        times = [time for search in own for time in decision_s(search)]
+        rows.append(summarize(columns, own, None if own is first else first, times))
+    return {"rows": rows, "tasks": tasks}
 
 
 def result_of(
@@ -299,7 +375,7 @@ def check_result(path: Path) -> Row:
     """
     result: Row = read_json(path)
     ResultFile.parse(result, str(path))
-    suite = Suite.packaged()
+    suite = Suite.packaged(result["suite"])
 
     def require(field: str, value: Any, wanted: Any) -> None:
         # Times were rounded to 1 ms.
