@@ -1,4 +1,4 @@
-"""The tables on the page of the leaderboard, made from its result files: `python docs/leaderboard.py`."""
+"""The tables on the pages of the leaderboard, made from its result files: `python docs/leaderboard.py`."""
 
 import re
 from pathlib import Path
@@ -9,16 +9,15 @@ from parkenv.studies.benchmark.suite import Suite, check_result
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "leaderboard"
-PAGE = FOLDER / "index.md"
+PAGES = {"index.md": "results", "streets.md": "streets"}
+"""Pages of the suites, and the folders of their results."""
 START, END = "<!-- {}: made by docs/leaderboard.py -->\n", "<!-- end -->\n"
 
 
-def tables():
-    """Make the tables of the page, by name."""
-    suite, entries = (
-        Suite.packaged(),
-        entries_of([check_result(file) for file in result_files(FOLDER / "results")]),
-    )
+def tables(folder):
+    """Make the tables of a page from the results in a folder, by name."""
+    results = [check_result(file) for file in result_files(FOLDER / folder)]
+    suite, entries = Suite.packaged(results[0]["suite"]), entries_of(results)
     lines = [
         "| | agent | score, % | mean time, s | behind the best, s | ms a decision | submitted by | code | commit |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -49,14 +48,16 @@ def interval(row, name, sign=""):
     return interval_text(row[name], ends, f"{sign}.1f") if ends[1] > ends[0] else ""
 
 
-def page(text):
-    """Return the page with its tables made anew."""
-    for name, table in tables().items():
+def page(text, folder):
+    """Return a page with its tables made anew."""
+    for name, table in tables(folder).items():
         start = START.format(name)
-        before, _, rest = text.partition(start)
-        text = f"{before}{start}\n{table}\n\n{END}{rest.partition(END)[2]}"
+        before, found, rest = text.partition(start)
+        text = f"{before}{start}\n{table}\n\n{END}{rest.partition(END)[2]}" if found else text
     return text
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for name, folder in PAGES.items():
+        path = FOLDER / name
+        path.write_text(page(path.read_text(encoding="utf-8"), folder), encoding="utf-8")
