@@ -68,11 +68,11 @@ def process_taken(process, key, arrival, slot, time):
 
 
 def recorded_taken(occupancy, arrival, slot, time):
-    """Whether a slot of a replayed log is taken: the last observation before, or the first of the day."""
-    log, mapped = occupancy.log, occupancy.mapped_log(arrival.day)
-    looks = slice(*log.first[mapped.record[slot] : mapped.record[slot] + 2])
-    before = np.flatnonzero(log.from_s[looks] <= time - weekday_of(arrival.day) * 86_400.0)
-    return bool(log.occupied[looks][before[-1]])
+    """Whether a slot of a replayed log is taken: the last of its states that has begun."""
+    states = occupancy.day_states(arrival.day)
+    own = slice(*states.first[slot : slot + 2])
+    before = np.flatnonzero(states.from_s[own] <= time - weekday_of(arrival.day) * 86_400.0)
+    return bool(states.occupied[own][before[-1]])
 
 
 class ReferenceSearch:

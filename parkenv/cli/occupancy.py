@@ -13,7 +13,15 @@ from parkenv.cli.tables import make_console, print_rows, save_summary, stages
 from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
-from parkenv.scenarios.spec import Date, Places, scenario_spec
+from parkenv.scenarios.spec import (
+    CAPACITY_HELP,
+    COLUMNS_HELP,
+    COLUMNS_TAKE,
+    TIMEZONE_HELP,
+    Capacity,
+    Date,
+    scenario_spec,
+)
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
@@ -35,12 +43,23 @@ SCORE_COLUMNS = (
     Column("difference", "log-loss more than ours", digits=4, signed=True),
 )
 LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
-TimeZone = Annotated[str, Option(takes="NAME")]
-Capacity = Annotated[
-    Places | None,
-    Option(takes="PLACES", default="the file's"),
-    Field(description="Places of the car park, for counts without such a column."),
+TimeZone = Annotated[
+    str | None, Option(takes="NAME", default="times are local"), Field(description=TIMEZONE_HELP)
 ]
+Places = Annotated[
+    Capacity | None,
+    Option(takes="PLACES|FILE|largest", default="the file's", parse=str),
+    Field(description=CAPACITY_HELP),
+]
+Columns = Annotated[
+    str | None,
+    Option(takes=COLUMNS_TAKE, default="found by their names", parse=str),
+    Field(description=COLUMNS_HELP),
+]
+_LOG_HELP = (
+    "A log of bays (bay with arrival and departure, since and state, or time and state) or counts (car_park, capacity, "
+    "free or taken, with hour or time), .csv or .csv.gz."
+)
 
 
 class Fit(Command):
@@ -61,15 +80,13 @@ class Fit(Command):
         parkenv occupancy fit car_parks.csv.gz --out results/car-parks
         """
 
-    log: LogFile = Field(
-        description="A log, datetime,camera,slot_id,weather,occupied, or counts, car_park,capacity,hour,free (or "
-        "hour_utc, time, time_utc), as .csv or .csv.gz."
-    )
+    log: LogFile = Field(description=_LOG_HELP)
     max_gap_h: float = option(
         2.0, "Observations of a log that are farther apart than this, h, are independent.", takes="H", ge=0
     )
-    timezone: TimeZone = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
-    capacity: Capacity = None
+    timezone: TimeZone = None
+    capacity: Places = None
+    columns: Columns = None
     out: Path = option(
         Path("results/occupancy"),
         "Folder for summary.json and, for a log, process.json and rates.png.",
@@ -78,18 +95,13 @@ class Fit(Command):
 
     def run(self) -> None:
         from parkenv.studies.occupancy import fit
+        from parkenv.world.occupancy.log import RecordedFile
 
         console = make_console()
         with stages(console) as progress:
             make_folder(self.out)
-            report = fit(
-                self.log,
-                self.out,
-                max_gap_s=3600.0 * self.max_gap_h,
-                timezone=self.timezone,
-                capacity=self.capacity,
-                progress=progress,
-            )
+            recorded = RecordedFile((self.log,), self.timezone, self.capacity, self.columns)
+            report = fit(recorded, self.out, max_gap_s=3600.0 * self.max_gap_h, progress=progress)
         _show(console, report, self.out, None, COLUMNS)
 
 
@@ -107,16 +119,14 @@ class Evaluate(Command):
         parkenv occupancy evaluate CNR-EXT.csv.gz --from 2015-12-03
         """
 
-    log: LogFile = Field(
-        description="Counts, car_park,capacity,hour,free (or hour_utc, time, time_utc), or a log of slots, "
-        "datetime,camera,slot_id,weather,occupied, as .csv or .csv.gz."
-    )
+    log: LogFile = Field(description=_LOG_HELP)
     from_day: Date | None = option(
         None, "First scored day.", name="--from", takes="DATE", default="the middle of the file"
     )
     car_parks: Axis[str] | None = option(None, "Car parks.", takes="NAME[,...]", default="all")
-    timezone: TimeZone = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
-    capacity: Capacity = None
+    timezone: TimeZone = None
+    capacity: Places = None
+    columns: Columns = None
     seed: Seed = Field(0, description="Seed of the bootstrap.")
     out: Path = option(
         Path("results/forecasts"), "Folder for summary.json and a picture of each model.", short="-o"
@@ -124,17 +134,16 @@ class Evaluate(Command):
 
     def run(self) -> None:
         from parkenv.studies.occupancy import evaluate
+        from parkenv.world.occupancy.log import RecordedFile
 
         console = make_console()
         with stages(console) as progress:
             make_folder(self.out)
             report = evaluate(
-                self.log,
+                RecordedFile((self.log,), self.timezone, self.capacity, self.columns),
                 self.out,
                 from_day=self.from_day,
                 car_parks=self.car_parks,
-                timezone=self.timezone,
-                capacity=self.capacity,
                 seed=self.seed,
                 progress=progress,
             )

@@ -34,5 +34,7 @@ BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
 """Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`."""
+SAME_SLOTS = "same"
+"""Mapping of a log whose slots have the names of the lot's, or of counts by the names of its facilities or zones."""
 OBSERVED, UNOBSERVED = "observed", "unobserved"
 """Whether the agent of a driven trip observes slots from the lane."""

@@ -14,7 +14,8 @@ from scipy.special import logit
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import with_extra
-from parkenv.forecast.counts import HOURS, Counts
+from parkenv.forecast.count_table import HOURS
+from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_curves import CurveSettings, forecast_days
 from parkenv.forecast.day_forecast import DIAGONAL, DayForecast, calibrated, logits
 from parkenv.forecast.scores import Scores
@@ -129,10 +130,10 @@ def with_past_errors(points: FloatArray, counts: Counts, first: int) -> DayForec
         points = np.where(np.isfinite(points), points, other)
     points = np.clip(points, 0.0, 1.0)
     c, d, _ = points.shape
-    edge = 0.5 / (counts.capacity[:, :, None] + 1.0)
+    edge = 0.5 / (counts.sample[:, :, None] + 1.0)
     mean = logit(np.clip(points, edge, 1.0 - edge))
     observed = np.isfinite(counts.seen)
-    error = np.where(observed, logits(counts.seen, counts.capacity[:, :, None]) - mean, 0.0)
+    error = np.where(observed, logits(counts.seen, counts.sample[:, :, None]) - mean, 0.0)
     covariance = np.empty((c, d, HOURS, HOURS), np.float32)
     level = np.full(c, _PRIOR_VARIANCE)
     hours = np.full((c, HOURS), _PRIOR_VARIANCE)

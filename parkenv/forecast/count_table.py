@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
@@ -28,67 +28,158 @@ MAX_NAME = 200
 MAX_DAYS = 400_000
 """Maximum number of car parks times days of a file of counts."""
 NAMES = {
-    "car_park": "car_park carpark parkhaus parkplatz parking name",
+    "car_park": "car_park carpark parkhaus parkplatz parking blockface kerb facility block group name",
     "capacity": "capacity kapazität kapazitaet stellplätze stellplaetze plätze plaetze spaces",
     "free": "free free_spaces free_places available frei freie_plätze freie_plaetze",
-    "taken": "taken occupied occupied_spaces belegt belegte_plätze belegte_plaetze besetzt",
-    "hour": "hour",
+    "taken": "taken occupied occupied_spaces cars cars_paid_spaces belegt belegte_plätze belegte_plaetze besetzt",
+    "hour": "hour round",
     "hour_utc": "hour_utc",
     "time_utc": "time_utc",
     "date": "date datum tag",
     "time": "time zeit uhrzeit datetime timestamp zeitpunkt zeitstempel datum_zeit datum_uhrzeit",
 }
-"""Names of each kind of column, in lower case and with `_` for other characters than letters."""
+"""Names of each kind of column, in lower case and with `_` for other characters than letters. A car park has the first
+of its names.
+"""
+LARGEST = "largest"
+"""Stands for a capacity: the largest count of the car park."""
 TIMES = ("hour", "hour_utc", "time", "time_utc")
 """Kinds of columns that say when a reading was taken, one of them in a table; a date may stand beside it."""
 UNKNOWN = ("-", "--", "?", "k.a.", "k. a.", "n/a", "na", "null", "none")
 """Texts of readings without a value, as empty ones."""
 _FORMATS = ("%d.%m.%Y %H:%M", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M", "%Y/%m/%d %H:%M:%S", "%Y-%m-%d %H:%M")
 _AN_INSTANT = timedelta(microseconds=1)
+HOURS, HOUR_S, DAY_S = 24, 3600.0, 86_400.0
+FIRST_DAY = date(2000, 1, 1).toordinal()
+FINE = 1.5
+"""Readings in an hour from which on a table has several an hour: they are used all."""
+
+
+Capacity = float | Path | str | None
+"""Places of the only car park, a table of car parks and their capacities, or `LARGEST`; None: those of the table."""
 
 
 class Readings(NamedTuple):
-    """Readings of car parks in order of time; each array (k,)."""
+    """Readings of car parks in order of time; each array (k,).
+
+    With several readings an hour, `hour` is that in which a reading was taken, else that at whose end it holds.
+    """
 
     car_parks: tuple[str, ...]  # (c,) names, ascending
     first: date
     n_days: int
     park: NDArray[np.int64]  # index of the car park
     day: NDArray[np.int64]  # days since the first
-    hour: NDArray[np.int64]  # of the day, at whose end the reading holds
+    hour: NDArray[np.int64]  # of the day
+    second: FloatArray  # float64, s since the first day's midnight, of the time in the table
     capacity: FloatArray  # float64, places
     free: FloatArray  # float64, places; NaN if unknown
+    per_hour: float  # mean number of readings in an hour that has some
 
 
-def is_counts(path: str | Path) -> bool:
-    """Whether a table is not a log of slots."""
-    _, header = next(csv_rows(path, MAX_COUNT_BYTES), (0, []))
-    return "slot_id" not in header
+class Clock:
+    """Reads times of a table as seconds of local time since `FIRST_DAY`; `timezone` is the IANA name of its zone."""
+
+    def __init__(self, path: str | Path, timezone: str | None = None) -> None:
+        try:
+            self.zone = None if timezone is None else ZoneInfo(timezone)
+        except (KeyError, ValueError, OSError) as error:
+            raise InputError(f"timezone is {timezone!r}, want an IANA name such as Europe/Berlin") from error
+        self.path = path
+        self._known: dict[tuple[str, bool], float] = {}
+
+    def __call__(self, text: str, utc: bool = False, before: timedelta = timedelta(0)) -> float:
+        """Return the local time `before` a given one; ValueError for what is no time."""
+        if (text, utc) not in self._known:
+            moment = _moment(text.strip())
+            if utc or moment.tzinfo is not None:
+                if self.zone is None:
+                    raise InputError(
+                        f"{self.path}: has times in UTC or with an offset, want --timezone, the local time "
+                        "zone, such as Europe/Berlin"
+                    )
+                moment = ((moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - before).astimezone(
+                    self.zone
+                )
+            else:
+                moment -= before
+            second = (moment.hour * 60 + moment.minute) * 60 + moment.second + moment.microsecond * 1e-6
+            self._known[text, utc] = (moment.toordinal() - FIRST_DAY) * DAY_S + second
+        return self._known[text, utc]
+
+    def reads(self, title: str) -> bool:
+        try:
+            return len(title) > len("2024-03-01") and bool(self(title))
+        except (ValueError, OverflowError, InputError):
+            return False
 
 
-def read_table(path: str | Path, zone: ZoneInfo, capacity: float | None = None) -> Readings:
-    """Read a table; `capacity` is the number of places of its only car park if it has no such column."""
+def folded(title: str) -> str:
+    return re.sub(r"[\W_]+", "_", title.strip().casefold()).strip("_")
+
+
+def chosen(path: str | Path, columns: str | None) -> dict[str, list[str]]:
+    """Parse `KIND=COLUMN,...`; the values of a kind may be the sum of several columns, `taken=green+red`."""
+    pairs = [word.partition("=") for word in (columns or "").split(",") if word.strip()]
+    if not all(kind.strip() and title.strip() for kind, _, title in pairs):
+        raise InputError(
+            f"{path}: columns is {columns!r:.80}, want MEANING=COLUMN,... such as bay=Marker,time=When"
+        )
+    return {kind.strip(): [word.strip() for word in title.split("+")] for kind, _, title in pairs}
+
+
+def titled_rows(path: str | Path, columns: str | None = None) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a table, its header first, with the columns that the user names under what they mean."""
     rows = csv_rows(path, MAX_COUNT_BYTES)
     _, header = next(rows, (0, []))
-    at = _columns(path, header, capacity)
+    named = chosen(path, columns)
+    for title in (title for titles in named.values() for title in titles):
+        if title not in header:
+            raise InputError(f"{path}: has no column {title!r:.40}, but {', '.join(header)!r:.200}")
+    at = [[header.index(title) for title in titles] for titles in named.values()]
+    hidden = {i for places in at for i in places} | {
+        i for i, title in enumerate(header) if any(_alike(kind, folded(title)) for kind in named)
+    }
+    yield 0, ["" if i in hidden else title for i, title in enumerate(header)] + list(named)
+    for line, row in rows:
+        yield line, row + [row[i] if not more else _sum(row, (i, *more)) for i, *more in at]
+
+
+def _alike(kind: str, title: str) -> bool:
+    """Whether a column says the same as one of a kind that the user names."""
+    kinds = {kind, *((*TIMES, "date") if kind in (*TIMES, "date") else ())}
+    return any(title in NAMES.get(name, "").split() for name in kinds)
+
+
+def _sum(row: Sequence[str], at: Sequence[int]) -> str:
+    """Return a sum as text; what is no number counts as none, but without any there is no sum."""
+    numbers = [float(row[i]) for i in at if re.fullmatch(r"\s*\d{1,9}(\.\d+)?\s*", row[i])]
+    return str(sum(numbers)) if numbers else ""
+
+
+def read_table(
+    path: str | Path, timezone: str | None = None, capacity: Capacity = None, columns: str | None = None
+) -> Readings:
+    """Read a table; the time zone is that of the local time, wanted if times are in UTC or have an offset."""
+    rows = titled_rows(path, columns)
+    _, header = next(rows)
+    at, clock = _columns(path, header, capacity), Clock(path, timezone)
     when = [at[kind] for kind in ("date", *TIMES) if kind in at]
-    utc, before = not at.keys().isdisjoint({"hour_utc", "time_utc"}), _AN_INSTANT
-    if not at.keys().isdisjoint({"hour", "hour_utc"}):
-        before = timedelta(0)
+    utc = not at.keys().isdisjoint({"hour_utc", "time_utc"})
+    before = timedelta(0) if not at.keys().isdisjoint({"hour", "hour_utc"}) else _AN_INSTANT
     whole, free_at, taken_at = (at.get(kind) for kind in ("capacity", "free", "taken"))
     own_name = re.sub(r"(\.csv)?(\.gz)?$", "", Path(path).name)
     names: dict[str, int] = {}
-    times: dict[str, tuple[int, int, float]] = {}
     numbers: dict[str, float] = {}
-    table: list[tuple[int, int, int, float, float, float]] = []
+    stated = _capacities(capacity) if isinstance(capacity, Path) else {}
+    table: list[tuple[float, ...]] = []
     for line, row in rows:
         name = row[at["car_park"]] if "car_park" in at else own_name
         if name not in names and not (0 < len(name) <= MAX_NAME and name.isprintable()):
             raise InputError(f"{path}: line {line}: car_park is {name!a:.40}, want a printable name")
         moment = row[when[0]] if len(when) == 1 else " ".join(row[i].strip() for i in when)
         try:
-            if moment not in times:
-                times[moment] = _local_hour(moment, zone, utc, before)
+            time = clock(moment, utc, before)
         except (ValueError, OverflowError):
             wanted = "a time such as 2024-03-01T07:00 or 01.03.2024 07:00"
             raise InputError(
@@ -103,28 +194,54 @@ def read_table(path: str | Path, zone: ZoneInfo, capacity: float | None = None) 
                     f"{path}: line {line}: {header[i or 0]} is {row[i or 0]!r:.40}, want a number"
                 ) from None
         places, free, taken = values
-        places = (free + taken if capacity is None else capacity) if whole is None else places
+        if whole is None:
+            places = capacity if isinstance(capacity, int | float) else stated.get(name, free + taken)
         free = places - taken if free_at is None else free
-        table.append((names.setdefault(name, len(names)), *times[moment], places, free))
+        table.append((names.setdefault(name, len(names)), time, places, free, taken))
     if not table:
         raise InputError(f"{path}: has no readings, want at least one")
-    if capacity is not None and len(names) > 1:
-        raise InputError(f"{path}: has {len(names)} car parks, want a column of their capacities")
+    if isinstance(capacity, int | float) and len(names) > 1:
+        raise InputError(
+            f"{path}: has {len(names)} car parks, want a column of their capacities, or --capacity FILE"
+        )
     _require_no_thousands(path, numbers)
-    return _in_order(path, names, np.array(table, float))
+    readings = np.array(table, float)
+    if capacity == LARGEST:
+        largest, park = np.ones(len(names)), readings[:, 0].astype(np.int64)
+        np.fmax.at(largest, park, readings[:, 4])
+        readings[:, 2], readings[:, 3] = largest[park], largest[park] - readings[:, 4]
+    return _in_order(path, names, readings, before.total_seconds())
 
 
-def _columns(path: str | Path, header: Sequence[str], capacity: float | None) -> dict[str, int]:
+def _capacities(path: Path) -> dict[str, float]:
+    """Read the capacities of car parks; one without a number has none."""
+    rows = titled_rows(path)
+    _, header = next(rows)
+    at, numbers = _kinds(path, header), dict[str, float]()
+    if not {"car_park", "capacity"} <= at.keys():
+        raise InputError(f"{path}: has the columns {', '.join(header)!r:.120}, want car_park and capacity")
+    try:
+        return {row[at["car_park"]]: _number(row[at["capacity"]], numbers) for _, row in rows}
+    except ValueError:
+        raise InputError(f"{path}: a capacity is no number, want numbers of places") from None
+
+
+def _kinds(path: str | Path, header: Sequence[str]) -> dict[str, int]:
+    at: dict[str, int] = {}
+    titles = [folded(title) for title in header]
+    for i, title in enumerate(titles):
+        kind = next((kind for kind, names in NAMES.items() if title in names.split()), None)
+        if kind in at and kind != "car_park":
+            raise InputError(f"{path}: columns {header[at[kind]]!r} and {header[i]!r} say the same, want one")
+        if kind is not None:
+            at[kind] = next(titles.index(name) for name in NAMES[kind].split() if name in titles)
+    return at
+
+
+def _columns(path: str | Path, header: Sequence[str], capacity: Capacity) -> dict[str, int]:
     if not header:
         raise InputError(f"{path}: is empty, want a table of counts")
-    at: dict[str, int] = {}
-    for i, title in enumerate(header):
-        folded = re.sub(r"[\W_]+", "_", title.strip().casefold()).strip("_")
-        kind = next((kind for kind, names in NAMES.items() if folded in names.split()), None)
-        if kind in at:
-            raise InputError(f"{path}: columns {header[at[kind]]!r} and {title!r} say the same, want one")
-        if kind is not None:
-            at[kind] = i
+    at = _kinds(path, header)
     lacks = {
         "a column of times (hour, hour_utc, time or time_utc)": at.keys().isdisjoint(("date", *TIMES)),
         "a column of free or taken places (free or taken)": at.keys().isdisjoint({"free", "taken"}),
@@ -135,7 +252,8 @@ def _columns(path: str | Path, header: Sequence[str], capacity: float | None) ->
     if wanted := [what for what, is_missing in lacks.items() if is_missing]:
         titles = ", ".join(header)
         raise InputError(
-            f"{path}: has the columns {titles!r:.120}, of neither a log of slots nor counts: want {'; '.join(wanted)}"
+            f"{path}: has the columns {titles!r:.120}, of neither counts nor a log of bays (bay with arrival and "
+            f"departure, since and state, or time and state): want {'; '.join(wanted)}; see --columns"
             if len(wanted) > 1
             else f"{path}: has the columns {titles!r:.120}, want {wanted[0]}"
         )
@@ -169,15 +287,6 @@ def _require_no_thousands(path: str | Path, numbers: dict[str, float]) -> None:
         raise InputError(f"{path}: has the number {dotted[0]!r}, want whole numbers without separators")
 
 
-def _local_hour(text: str, zone: ZoneInfo, utc: bool, before: timedelta) -> tuple[int, int, float]:
-    """Return the day (proleptic Gregorian ordinal), the hour and the Unix time of the time `before` a given one."""
-    moment = _moment(text.strip()) - before
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC if utc else zone)
-    moment = moment if moment.tzinfo is zone else moment.astimezone(zone)
-    return moment.toordinal(), moment.hour, moment.timestamp()
-
-
 def _moment(text: str) -> datetime:
     if len(text) <= len("2024-03-01"):
         raise ValueError("a day without a time")
@@ -186,15 +295,19 @@ def _moment(text: str) -> datetime:
             return datetime.strptime(text, form) if form else datetime.fromisoformat(text)
         except ValueError:
             continue
-    raise ValueError("no time")
+    raise ValueError(f"the time is {text!r:.40}, want one such as 2015-11-12 07:09")
 
 
-def _in_order(path: str | Path, names: dict[str, int], values: FloatArray) -> Readings:
-    newest_first = values[0, 3] > values[-1, 3]
+def _in_order(path: str | Path, names: dict[str, int], values: FloatArray, before_s: float) -> Readings:
+    newest_first = values[0, 1] > values[-1, 1]
     values = values[::-1] if newest_first else values
-    values = values[np.argsort(values[:, 3], kind="stable")]
+    values = values[np.argsort(values[:, 1], kind="stable")]
     rank = np.unique(list(names), return_inverse=True)[1]
-    days = values[:, 1].astype(np.int64)
+    # In whole milliseconds, so that the instant that was taken off is put back.
+    moments = np.round(values[:, 1] + before_s, 3)
+    per_hour = len(values) / len(np.unique(np.stack([values[:, 0], moments // HOUR_S], axis=1), axis=0))
+    time = moments if per_hour >= FINE else values[:, 1]
+    days = (time // DAY_S).astype(np.int64)
     n_days = int(days.max() - days.min()) + 1
     if n_days * len(names) > MAX_DAYS:
         raise InputError(
@@ -202,11 +315,13 @@ def _in_order(path: str | Path, names: dict[str, int], values: FloatArray) -> Re
         )
     return Readings(
         tuple(sorted(names)),
-        date.fromordinal(int(days.min())),
+        date.fromordinal(int(days.min()) + FIRST_DAY),
         n_days,
         rank[values[:, 0].astype(np.int64)],
         days - days.min(),
-        values[:, 2].astype(np.int64),
-        values[:, 4],
-        values[:, 5],
+        (time % DAY_S // HOUR_S).astype(np.int64),
+        moments - days.min() * DAY_S,
+        values[:, 2],
+        values[:, 3],
+        per_hour,
     )

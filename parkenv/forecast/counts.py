@@ -14,7 +14,11 @@ changed or dropped is counted under the name of its rule:
 - `capacity_estimated`: days of a car park where in the 28 days before more than 5 % of the readings exceed the stated
   capacity. The 98 % quantile of those readings then serves as the capacity.
 - `duplicate`: several readings of one hour; the last in time counts. In the hour that comes twice, their mean.
-- `summer_time`: days of 23 or 25 hours. `gap`: hours without a reading between a car park's first and last day.
+- `summer_time`: days of 23 or 25 hours, where a time zone is given. `gap`: hours without a reading between a car park's
+  first and last day.
+
+Of a table with several readings an hour all are used: the occupancy of an hour is their mean, `moments` has all of
+them, and `duplicate` are those of a car park at the same time.
 
 Every rule looks back only: what is known of a day does not depend on later days. The exception are the hours of a run
 before it is recognised as stuck: `seen` has them, `occupied` has not.
@@ -28,6 +32,7 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -35,13 +40,23 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError, nearest
-from parkenv.forecast.count_table import Readings, read_table
+from parkenv.forecast.count_table import DAY_S, FINE, HOURS, Capacity, Readings, read_table
 
-HOURS = 24
 _TOLERANCE = 0.05  # of the capacity
 _SURPRISE = math.log(1e9)
 _WINDOW = 28  # days
 _REPEATS_PRIOR = (2.0, 4.0)  # repeats of readings, and pairs, assumed before any is seen
+
+
+_MOST_PER_HOUR = 4.0
+"""Readings an hour that say something of their own: cars stay for longer than the quarter of an hour between them."""
+
+
+class Moments(NamedTuple):
+    """Readings of a car park in order of time, each array (k,)."""
+
+    second: FloatArray  # float64, s since the midnight of the first day
+    occupied: FloatArray  # float64, fraction of the places that is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,21 +72,32 @@ class Counts:
     seen: FloatArray
     faults: tuple[dict[str, int], ...]  # (c,) number of readings, or days, by rule
     source: str = "counts"  # name of the file in messages
+    # (c,) of a table with several readings an hour; empty: one
+    moments: tuple[Moments, ...] = ()
+    per_hour: float = 1.0  # number of readings in an hour that say something of their own
 
     @classmethod
-    def read(cls, path: str | Path, timezone: str = "Europe/Berlin", capacity: float | None = None) -> Counts:
+    def read(
+        cls,
+        path: str | Path,
+        timezone: str | None = None,
+        capacity: Capacity = None,
+        columns: str | None = None,
+    ) -> Counts:
         """Read and clean a file of counts, .csv or .csv.gz.
 
         Args:
             path: a table, see `count_table`.
-            timezone: IANA name of the local time of `hour_utc` and `time_utc`, and of the days of summer time.
-            capacity: places of the only car park of a table without such a column.
+            timezone: IANA name of the local time, wanted if times are in UTC; of the days of summer time.
+            capacity: places, see `count_table.Capacity`.
+            columns: names of columns that are not recognised, see `count_table.chosen`.
         """
-        try:
-            zone = ZoneInfo(timezone)
-        except (KeyError, ValueError, OSError) as error:
-            raise InputError(f"timezone is {timezone!r}, want an IANA name such as Europe/Berlin") from error
-        return _cleaned(read_table(path, zone, capacity), zone, str(path))
+        return _cleaned(read_table(path, timezone, capacity, columns), timezone, str(path))
+
+    @property
+    def sample(self) -> FloatArray:
+        """(c, d) float64, number of places that an hour's occupancy is the mean of: it has that of several readings."""
+        return self.capacity * self.per_hour
 
     @cached_property
     def weekday(self) -> NDArray[np.int64]:
@@ -80,6 +106,14 @@ class Counts:
     def day_index(self, day: date) -> int:
         """Return the index of a date; 0 for one before the first, `len(days)` for one after the last."""
         return min(max((day - self.days[0]).days, 0), len(self.days))
+
+    def readings(self, car_park: int) -> Moments:
+        """Return all readings of a car park; hourly ones hold at the ends of their hours."""
+        if self.moments:
+            return self.moments[car_park]
+        occupied = self.occupied[car_park].ravel()
+        known = np.flatnonzero(np.isfinite(occupied))
+        return Moments(np.asarray((known + 1) * (DAY_S / HOURS)), occupied[known])
 
     def total_faults(self) -> dict[str, int]:
         return {name: sum(faults[name] for faults in self.faults) for name in self.faults[0]}
@@ -109,12 +143,15 @@ class Counts:
         days = slice(first, last)
         names, faults = zip(*((self.car_parks[i], self.faults[i]) for i in rows), strict=True)
         capacity, occupied, seen = (array[rows, days] for array in (self.capacity, self.occupied, self.seen))
-        return Counts(names, self.days[days], capacity, occupied, seen, faults, self.source)
+        moments = tuple(self.moments[i] for i in rows) if self.moments and first == 0 else ()
+        return Counts(
+            names, self.days[days], capacity, occupied, seen, faults, self.source, moments, self.per_hour
+        )
 
 
-def _cleaned(readings: Readings, zone: ZoneInfo, source: str) -> Counts:
+def _cleaned(readings: Readings, timezone: str | None, source: str) -> Counts:
     days = tuple(readings.first + timedelta(i) for i in range(readings.n_days))
-    changes = _summer_time(days, zone)
+    changes = {} if timezone is None else _summer_time(days, ZoneInfo(timezone))
     stated, free, duplicates = _by_hour(readings, changes)
     known = np.isfinite(stated)
     stated = _carried_forward(stated)
@@ -142,7 +179,21 @@ def _cleaned(readings: Readings, zone: ZoneInfo, source: str) -> Counts:
         for i, span in enumerate(spans)
     )
     usable, seen = (np.where(mask, np.nan, occupied) for mask in (stuck, recognised))
-    return Counts(readings.car_parks, days, capacity, usable, seen, faults, source)
+    if readings.per_hour < FINE:
+        return Counts(readings.car_parks, days, capacity, usable, seen, faults, source)
+    moments = tuple(_moments(readings, i, usable[i], capacity[i]) for i in range(len(capacity)))
+    rate = min(readings.per_hour, _MOST_PER_HOUR)
+    return Counts(readings.car_parks, days, capacity, usable, seen, faults, source, moments, rate)
+
+
+def _moments(readings: Readings, park: int, usable: FloatArray, capacity: FloatArray) -> Moments:
+    # Those of the hours that are used; of several at the same time the last.
+    of = np.flatnonzero((readings.park == park) & np.isfinite(readings.free))
+    of = of[np.isfinite(usable[readings.day[of], readings.hour[of]])]
+    of = of[np.append(np.diff(readings.second[of]) > 0, True)[: of.size]]
+    return Moments(
+        readings.second[of], np.clip(1.0 - readings.free[of] / capacity[readings.day[of]], 0.0, 1.0)
+    )
 
 
 def _summer_time(days: tuple[date, ...], zone: ZoneInfo) -> dict[int, int]:
@@ -175,6 +226,17 @@ def _by_hour(readings: Readings, changes: dict[int, int]) -> tuple[FloatArray, F
     free, stated = np.full(c * d * HOURS, np.nan), np.full(c * d, np.nan)
     free[key], stated[park_day] = readings.free[usable], readings.capacity[usable]  # the last one stays
     times = np.bincount(key, minlength=free.size)
+    if readings.per_hour >= FINE:  # all but those at the same time, in the mean
+        order = np.flatnonzero(usable)[np.lexsort((np.arange(key.size), readings.second[usable], key))]
+        second, cell = readings.second[order], (readings.park * d + readings.day) * HOURS + readings.hour
+        kept = order[np.append((np.diff(second) > 0) | (np.diff(cell[order]) > 0), True)[: order.size]]
+        total, n = (
+            np.bincount(cell[kept], readings.free[kept], free.size),
+            np.bincount(cell[kept], minlength=free.size),
+        )
+        free = np.divide(total, n, out=free, where=n > 0)
+        again = np.bincount(readings.park[order], minlength=c) - np.bincount(readings.park[kept], minlength=c)
+        return stated.reshape(c, d), free.reshape(c, d, HOURS), again
     extra = np.maximum(times - 1, 0).reshape(c, d, HOURS)
     for day, hour in changes.items():
         if hour >= 0:

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from scipy.special import expit, gammaln, logit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.forecast.counts import HOURS, Counts
+from parkenv.forecast.count_table import HOURS
+from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_forecast import DIAGONAL, FREEDOM, DayForecast, calibrated, logits
 from parkenv.forecast.scores import log_losses
 
@@ -242,7 +243,7 @@ def filter_days(
     for day in range(last):
         state.next_day()
         weekday = int(counts.weekday[day])
-        places = counts.capacity[:, max(min(day, until) - 1, 0), None]
+        places = counts.sample[:, max(min(day, until) - 1, 0), None]
         own = curve = state.curve(weekday)
         sunday = state.curve(_SUNDAY) if weekday != _SUNDAY and day >= _SETTLED else None
         if sunday is not None:
@@ -259,7 +260,7 @@ def filter_days(
         hours = np.isfinite(seen).sum(axis=1)
         learned = hours >= _MIN_HOURS
         if day < until and learned.any():
-            places = counts.capacity[:, day, None]
+            places = counts.sample[:, day, None]
             z = logits(seen, places)
             p = expit(z)
             weight = 1.0 / (settings.noise + 1.0 / (places * p * (1.0 - p) + 1.0))

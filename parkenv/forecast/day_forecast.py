@@ -22,7 +22,8 @@ from scipy.special import expit, ndtri
 from scipy.stats import chi2, qmc, t
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.forecast.counts import HOURS, Counts
+from parkenv.forecast.count_table import HOURS
+from parkenv.forecast.counts import Counts
 
 FREEDOM = 6.0
 """Degrees of freedom of the t distributions: days that nothing announces are far off more often than normal ones."""
@@ -107,7 +108,7 @@ class DayForecast:
         seen = counts.seen[:, days].copy()
         seen[:, :, hour:] = np.nan
         observed = np.isfinite(seen)
-        z = logits(seen, counts.capacity[:, days, None])
+        z = logits(seen, counts.sample[:, days, None])
         v = self.covariance.astype(float)
         within = np.where(observed[..., :, None] & observed[..., None, :], v, 0.0)
         within[..., DIAGONAL, DIAGONAL] += np.where(observed, 1e-9, 1.0)

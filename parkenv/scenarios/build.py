@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from parkenv.compiled.arrays import IntArray
 from parkenv.errors import InputError, naming, nearest, require_keywords
+from parkenv.files.known_names import SAME_SLOTS
 from parkenv.files.option import parse_call
 from parkenv.files.user_class import load_class
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
 from parkenv.scenarios.spec import (
-    SAME_SLOTS,
     CountsSpec,
     ForecastSpec,
     LotSpec,
@@ -51,12 +52,11 @@ if TYPE_CHECKING:
     from parkenv.forecast.day_forecast import DayForecast
     from parkenv.world.demand import TownDemand
     from parkenv.world.occupancy.arrival_window import ArrivalWindow
-    from parkenv.world.occupancy.counted import CountedOccupancy
-    from parkenv.world.occupancy.log import OccupancyLog
+    from parkenv.world.occupancy.log import OccupancyLog, RecordedFile
 
 LOT_KMH, TOWN_KMH = 10.0, 20.0
 """Default driving speeds: in a car park (the thesis's), and in a town, whose junctions are part of the mean."""
-MIN_PAST_DAYS = 7  # days of counts that a forecast needs at least
+MIN_PAST_DAYS = 2  # days of counts that a forecast needs at least
 ScenarioSource = str | Path | Mapping[str, Any] | ScenarioSpec | ParkingLot | Scenario
 ScenarioSources = ScenarioSource | Sequence[ScenarioSource]
 
@@ -227,24 +227,24 @@ def _lot(spec: LotSpec) -> ParkingLot:
 
 def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyModel:
     if spec.log is not None:
-        from parkenv.forecast.count_table import is_counts
-        from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping, same_slots
+        from parkenv.world.occupancy.log import RecordedFile
+        from parkenv.world.occupancy.recorded import read_mapping, same_slots
 
-        if is_counts(spec.log[0]):
+        file = RecordedFile(tuple(spec.log), spec.timezone, None, spec.columns)
+        if file.is_counts:
             raise InputError(
                 f"{spec.log[0]}: is not a log of slots; want a table `counts` for counts of car parks"
             )
-        log = _log(tuple(spec.log), tuple(map(_changed, spec.log)))
+        log = _log(file, tuple(map(_changed, spec.log)))
+        _warn_of_faults(log.faults, log.source)
         mapped = None
         if spec.mapping == SAME_SLOTS:
             mapped = same_slots(lot.slot_ids, log)
         elif spec.mapping is not None:
-            mapped = read_mapping(spec.mapping, lot.slot_ids, log)
-        return RecordedOccupancy(
-            log, lot.walk_m(goal), mapped, spec.replay_from, spec.forecast_from or "others"
-        )
+            mapped = read_mapping(spec.mapping, lot.slot_ids, log.slot_ids, log.source)
+        return _recorded(spec, log, mapped, lot, goal)
     if spec.counts is not None:
-        return _counted(spec.counts, spec.replay_from, spec.forecast_from == "past", lot, goal)
+        return _counted(spec, spec.counts, lot, goal)
     if spec.world is not None:
         return _own_world(spec.world, lot, goal)
     if spec.process is not None:
@@ -274,13 +274,29 @@ def _own_world(text: str, lot: ParkingLot, goal: int) -> OccupancyModel:
     return made
 
 
-def _counted(
-    spec: CountsSpec, first: date | None, past: bool, lot: ParkingLot, goal: int
-) -> CountedOccupancy:
-    from parkenv.forecast.usual_days import usual_days
-    from parkenv.world.occupancy.counted import CountedOccupancy
+def _recorded(
+    spec: OccupancySpec, log: OccupancyLog, mapped: IntArray | None, lot: ParkingLot, goal: int
+) -> OccupancyModel:
+    from parkenv.world.occupancy.recorded import RecordedOccupancy
 
-    counts = _counts(spec.file, _changed(spec.file), spec.timezone, spec.capacity)
+    if mapped is not None and (without := int((mapped < 0).sum())):
+        told = f"{without:,} of {mapped.size:,} slots of the lot have no record"
+        warnings.warn(f"{log.source}: {told}: they follow the forecast of the others", stacklevel=2)
+    days = spec.replay_from, spec.forecast_from or "others"
+    return RecordedOccupancy(log, lot.walk_m(goal), mapped, *days, lot.facility_of_slot)
+
+
+def _counted(occupancy: OccupancySpec, spec: CountsSpec, lot: ParkingLot, goal: int) -> OccupancyModel:
+    from parkenv.forecast.usual_days import usual_days
+    from parkenv.world.occupancy.counted import CountedOccupancy, car_park_of_slots, log_of_counts
+
+    counts, first = _counts(*_file_of(spec)), occupancy.replay_from
+    pull = attraction(lot, goal, spec.pull, spec.unevenness)
+    if occupancy.mapping is not None:
+        _warn_of_faults(counts.total_faults(), counts.source)
+        of_slot = car_park_of_slots(occupancy.mapping, lot, counts)
+        log = log_of_counts(counts, of_slot, lot.slot_ids, pull)
+        return _recorded(occupancy, log, np.where(of_slot < 0, -1, np.arange(lot.n_slots)), lot, goal)
     name = spec.car_park
     if name is None:
         name = counts.car_parks[0]
@@ -292,29 +308,35 @@ def _counted(
     elif name not in counts.car_parks:
         counts.chosen([name])  # says which names there are
     row, start, source = counts.car_parks.index(name), 0, f"{spec.file}: car park {name}"
-    _warn_of_counts(counts, row, source, is_stated=spec.capacity is not None)
+    _warn_of_counts(counts, row, source, is_stated=isinstance(spec.capacity, float))
+    if counts.moments:
+        log = log_of_counts(counts, np.full(lot.n_slots, row), lot.slot_ids, pull)
+        return _recorded(occupancy, log, np.arange(lot.n_slots), lot, goal)
     if first is None:
         mean, sd = usual_days(counts.occupied[row], counts.weekday, source)
     else:
-        forecast = _forecast(spec.file, _changed(spec.file), spec.timezone, spec.capacity, first, past)
+        forecast = _forecast(*_file_of(spec), first, occupancy.forecast_from == "past")
         start, mean, sd = forecast.first, forecast.mean[row], forecast.sd[row]
     return CountedOccupancy(
         tuple(day.isoformat() for day in counts.days[start:]),
         counts.occupied[row, start:],
         mean,
         sd,
-        attraction(lot, goal, spec.pull, spec.unevenness),
+        pull,
         spec.mean_stay_s,
         source,
     )
 
 
+def _warn_of_faults(faults: Mapping[str, int], source: str) -> None:
+    told = ", ".join(f"{name} {n}" for name, n in faults.items() if n and name not in ("summer_time", "gap"))
+    if told:
+        warnings.warn(f"{source}: readings corrected or left out: {told}", stacklevel=2)
+
+
 def _warn_of_counts(counts: Counts, row: int, source: str, *, is_stated: bool) -> None:
     """Tell which readings are not used as they are, and of counts that may be percentages."""
-    faults = {name: n for name, n in counts.faults[row].items() if n and name not in ("summer_time", "gap")}
-    if faults:
-        told = ", ".join(f"{name} {n}" for name, n in faults.items())
-        warnings.warn(f"{source}: readings corrected or left out: {told}", stacklevel=2)
+    _warn_of_faults(counts.faults[row], source)
     taken, whole = counts.occupied[row] * counts.capacity[row, :, None], counts.capacity[row].max()
     highest = np.nanmax([taken, counts.capacity[row, :, None] - taken], axis=(1, 2)).round(6)
     if is_stated and whole > 100.0 and 100.0 in highest:
@@ -329,39 +351,40 @@ def _changed(file: Path) -> int:
 
 
 @lru_cache(maxsize=2)
-def _log(files: tuple[Path, ...], changed: tuple[int, ...]) -> OccupancyLog:  # noqa: ARG001
+def _log(file: RecordedFile, changed: tuple[int, ...]) -> OccupancyLog:  # noqa: ARG001
     """Read a log once for all scenarios that replay it: they share the models that are fitted to its days."""
-    from parkenv.world.occupancy.log import OccupancyLog
-
-    return OccupancyLog.read_all(files)
+    return file.log()
 
 
-@lru_cache(maxsize=2)
-def _counts(file: Path, changed: int, timezone: str, capacity: float | None) -> Counts:  # noqa: ARG001
-    from parkenv.forecast.counts import Counts
+def _file_of(spec: CountsSpec) -> tuple[RecordedFile, int]:
+    from parkenv.world.occupancy.log import RecordedFile
 
-    return Counts.read(file, timezone, capacity)
+    return RecordedFile((spec.file,), spec.timezone, spec.capacity, spec.columns), _changed(spec.file)
 
 
 @lru_cache(maxsize=2)
-def _forecast(
-    file: Path, changed: int, timezone: str, capacity: float | None, first: date, past: bool
-) -> DayForecast:
+def _counts(file: RecordedFile, changed: int) -> Counts:  # noqa: ARG001
+    return file.counts()
+
+
+@lru_cache(maxsize=2)
+def _forecast(file: RecordedFile, changed: int, first: date, past: bool) -> DayForecast:
     """Forecast all days from the first one on; car parks learn special days from one another."""
     from parkenv.forecast.day_curves import CurveSettings, forecast_days
 
-    counts = _counts(file, changed, timezone, capacity)
-    index = counts.day_index(first)
-    if not MIN_PAST_DAYS <= index < len(counts.days):
+    counts = _counts(file, changed)
+    index, n, least = counts.day_index(first), len(counts.days), counts.days[0] + timedelta(MIN_PAST_DAYS)
+    if not MIN_PAST_DAYS <= index < n:
+        wanted = f"one from {least} on" if n > MIN_PAST_DAYS else "a longer record, or no replay_from"
         raise InputError(
-            f"{file}: replay_from is {first}, want one from {counts.days[0] + timedelta(MIN_PAST_DAYS)} to "
-            f"{counts.days[-1]}: the forecast needs {MIN_PAST_DAYS} days before it"
+            f"{file.files[0]}: replay_from is {first}, and the record has {n} days, {counts.days[0]} to "
+            f"{counts.days[-1]}: the forecast needs {MIN_PAST_DAYS} days before; want {wanted}"
         )
     return forecast_days(counts, index, "past" if past else "rolling", CurveSettings())
 
 
-def car_parks(file: Path, capacity: float | None = None) -> list[str]:
-    counts = _counts(file, _changed(file), "Europe/Berlin", capacity)
+def car_parks(spec: CountsSpec) -> list[str]:
+    counts = _counts(*_file_of(spec))
     return [name for name in counts.car_parks if name not in counts.idle()]
 
 

@@ -31,6 +31,7 @@ from parkenv.files.known_names import (
     LOT_SUFFIXES,
     MAX_CARS,
     PACKAGED_LOTS,
+    SAME_SLOTS,
     SCENARIO_NAMES,
     SENSOR_MODELS,
     ForecastFrom,
@@ -66,7 +67,6 @@ Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]  # s, at most a day
 Count = Annotated[int, Field(ge=0, le=1_000)]
 Size = Annotated[float, Field(ge=1.0, le=100.0)]  # m
 MAX_SLOTS = 1_000_000
-SAME_SLOTS = "same"  # mapping of a log whose slots have the names of the lot's
 
 
 def _require_one(spec: Spec, names: tuple[str, ...], least: int = 1) -> None:
@@ -213,16 +213,42 @@ def _day_error_text(text: str) -> object:
 Places = Annotated[float, Field(gt=0, le=1e6)]
 
 
+def _capacity(value: object, info: ValidationInfo) -> object:
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            return float(value)
+    return value if not isinstance(value, str | Path) or value == "largest" else resolved_path(value, info)
+
+
+CAPACITY_HELP = (
+    "Places of the car park, if no column has them; a table of car parks and their capacities (.csv); or largest: "
+    "the largest count of each."
+)
+Capacity = Annotated[Places | Literal["largest"] | Path, BeforeValidator(_capacity)]
+
+
+TIMEZONE_HELP = (
+    "Local time zone of a recorded log or counts, wanted if their times are in UTC or have an offset."
+)
+COLUMNS_HELP = (
+    "Columns of a recorded log or counts with other names than the usual ones, by what they mean: bay, arrival, "
+    "departure, since, updated, time, state; car_park, capacity, free, taken, hour, time, date. `_utc` behind a time: "
+    "in UTC."
+)
+COLUMNS_TAKE = "MEANING=COLUMN[,...]"
+
+
 class CountsSpec(_Popularity):
-    """Days of a car park of which the number of free places was counted every hour, replayed on the lot."""
+    """Days of car parks of which the number of free places was counted, replayed on the lot."""
 
     file: FilePath = Field(
         description="Counts: car_park,capacity,hour,free, each at its hour's end, or `time` for points in "
         "time; .csv, .csv.gz."
     )
     car_park: str | None = Field(None, description="Name of the car park in the file, if there are several.")
-    capacity: Places | None = Field(None, description="Places of the car park, if no column has them.")
-    timezone: str = Field("Europe/Berlin", description="Local time zone, for `hour_utc` and `time_utc`.")
+    capacity: Capacity | None = Field(None, description=CAPACITY_HELP)
+    timezone: str | None = Field(None, description=TIMEZONE_HELP)
+    columns: str | None = Field(None, description=COLUMNS_HELP)
 
 
 _Logs = Annotated[
@@ -254,12 +280,17 @@ class OccupancySpec(Spec):
         default="the file's only one",
         parse=words_in,
     )
-    capacity: Places | None = option(
+    capacity: Capacity | None = option(
         None,
-        "Places of the car park, for counts without such a column, such as a table of times and free places.",
-        takes="PLACES",
+        CAPACITY_HELP,
+        takes="PLACES|FILE|largest",
         panel="World",
         default="the file's",
+        parse=str,
+    )
+    timezone: str | None = option(None, TIMEZONE_HELP, takes="NAME", panel="World", default="times are local")
+    columns: str | None = option(
+        None, COLUMNS_HELP, takes=COLUMNS_TAKE, panel="World", default="found by their names", parse=str
     )
     world: str | None = Field(
         None,
@@ -282,7 +313,8 @@ class OccupancySpec(Spec):
     )
     mapping: Annotated[Path | str, BeforeValidator(_mapping)] | None = option(
         None,
-        "CSV slot_id,log_slot_id that assigns the log's slots to the lot's; same: those of the same names.",
+        "CSV slot_id,log_slot_id that assigns the log's slots, or the car parks of counts, to the lot's slots; same: "
+        "those of the same names, or facilities and zones named as car parks.",
         takes="FILE|same",
         panel="World",
         default="the log's fullest slots are nearest to the goal",
@@ -316,7 +348,11 @@ class OccupancySpec(Spec):
                 (self.car_parks or self.capacity) and not self.log,
                 "car_parks and capacity only together with counts as the log",
             ),
-            (self.mapping is not None and not self.log, "mapping only together with a log"),
+            (
+                (self.timezone or self.columns) and not self.log,
+                "timezone and columns only together with a log",
+            ),
+            (self.mapping is not None and not recorded, "mapping only together with a log or counts"),
             (dated and not recorded, "replay_from only together with a log or counts"),
             (
                 self.counts and dated and self.forecast_from == "others",

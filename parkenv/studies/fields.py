@@ -14,8 +14,9 @@ from parkenv.files.known_names import SCENARIO_NAMES, RigName
 from parkenv.files.limited_reading import is_there
 from parkenv.files.option import Inside, Option, seconds_of_minutes, words_in
 from parkenv.files.spec_file import Axis, DetectorName, OrText, Several, require_together
-from parkenv.forecast.count_table import is_counts
+from parkenv.forecast.event_table import is_counts
 from parkenv.scenarios.spec import (
+    CountsSpec,
     ScenarioSpec,
     TrafficSpec,
     lot_scenario,
@@ -57,14 +58,20 @@ def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...
     listed: list[ScenarioSpec] = []
     for scenario in scenarios:
         names, files = scenario.occupancy.car_parks, scenario.occupancy.log or ()
-        if len(files) != 1 or (names is None and not is_counts(files[0])):
+        columns = scenario.occupancy.columns
+        if len(files) != 1 or (names is None and not is_counts(files[0], columns)):
             listed.append(scenario)
             continue
-        counts: dict[str, Any] = {"file": files[0], "capacity": scenario.occupancy.capacity}
-        if names == ("all",):
+        options = ("capacity", "timezone", "columns")
+        counts: dict[str, Any] = {name: getattr(scenario.occupancy, name) for name in options} | {
+            "file": files[0]
+        }
+        if names == ("all",) and scenario.occupancy.mapping is None:
             from parkenv.scenarios.build import car_parks
 
-            names = tuple(car_parks(**counts))
+            names = tuple(car_parks(CountsSpec(**counts)))
+        if scenario.occupancy.mapping is not None:  # each car park on its own slots
+            names = None
         for name in names or (None,):
             title = (
                 scenario.title
@@ -72,7 +79,11 @@ def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...
                 else file_name(f"{scenario.title} {name}").replace(",", " ")[:80]
             )
             occupancy = scenario.occupancy.changed(
-                "--car-park", log=None, car_parks=None, capacity=None, counts={**counts, "car_park": name}
+                "--car-park",
+                log=None,
+                car_parks=None,
+                **dict.fromkeys(options),
+                counts={**counts, "car_park": name},
             )
             listed.append(scenario.changed("--car-park", name=title, occupancy=occupancy, forecast="own"))
     return tuple(listed)

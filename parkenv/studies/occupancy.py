@@ -12,7 +12,6 @@ import numpy as np
 
 from parkenv.errors import InputError
 from parkenv.forecast.comparison import MODELS, Compared, compare
-from parkenv.forecast.count_table import is_counts
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
 from parkenv.forecast.slot_comparison import ComparedSlots, compare_slot_days
@@ -22,7 +21,7 @@ from parkenv.show.plurals import plural
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
 from parkenv.world.occupancy.fit import fit_process
-from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.occupancy.log import OccupancyLog, RecordedFile
 from parkenv.world.week import DAY_S, HOUR_S
 
 
@@ -32,16 +31,15 @@ class FitReport(NamedTuple):
     notes: Sequence[str] = ()  # faults of the data, and what the rows leave out
 
 
-def fit(
-    log: Path, folder: Path, *, max_gap_s: float, timezone: str, capacity: float | None, progress: Progress
-) -> FitReport:
-    if is_counts(log):
-        return _fit_counts(Counts.read(log, timezone, capacity), progress)
+def fit(recorded: RecordedFile, folder: Path, *, max_gap_s: float, progress: Progress) -> FitReport:
+    if recorded.is_counts:
+        return _fit_counts(recorded.counts(), progress)
     progress("Fitting rates", 0, 0)
-    fitted = fit_process(OccupancyLog.read(log), max_gap_s=max_gap_s)
+    log = recorded.log()
+    fitted = fit_process(log, max_gap_s=max_gap_s)
     process = fitted.process
     process.to_file(folder / "process.json")
-    save_rates(process, folder / "rates.png", title=log.name)
+    save_rates(process, folder / "rates.png", title=recorded.files[0].name)
     rows = [
         {
             "day": name,
@@ -54,10 +52,11 @@ def fit(
         for hour in range(7, 19)
     ]
     summary = {"rows": rows, "log_likelihood": fitted.log_likelihood, "intervals": fitted.n_intervals}
-    summary["day_error"] = asdict(process.day_error)
-    title = f"{log.name}: {plural(len(fitted.slot_ids), 'slot')}, {plural(fitted.n_intervals, 'interval')}"
+    summary |= {"day_error": asdict(process.day_error), **_told_faults(log)}
+    name, intervals = recorded.files[0].name, plural(fitted.n_intervals, "interval")
+    title = f"{name}: {plural(len(fitted.slot_ids), 'slot')}, {intervals}"
     note = f"Days differ from the process by a standard deviation of {process.day_error.level:.2f} logits"
-    return FitReport(title, summary, [note])
+    return FitReport(title, summary, [*_log_faults(log), note])
 
 
 def _fit_counts(counts: Counts, progress: Progress) -> FitReport:
@@ -101,24 +100,23 @@ def _faults(counts: Counts) -> list[str]:
 
 
 def evaluate(
-    log: Path,
+    recorded: RecordedFile,
     folder: Path,
     *,
     from_day: date | None,
     car_parks: Sequence[str] | None,
-    timezone: str,
-    capacity: float | None,
     seed: int,
     progress: Progress,
 ) -> FitReport:
-    if not is_counts(log):
-        return _evaluate_log(log, folder, from_day, seed, progress)
-    counts = Counts.read(log, timezone, capacity)
+    if not recorded.is_counts:
+        return _evaluate_log(recorded.log(), recorded.files[0], folder, from_day, seed, progress)
+    counts = recorded.counts()
     counts = counts if car_parks is None else counts.chosen(list(car_parks))
     n = len(counts.days)
     first = n // 2 if from_day is None else counts.day_index(from_day)
     if not np.isfinite(counts.occupied[:, first:]).any():
-        raise InputError(f"--from is {from_day}: {counts.source} has no usable readings from then on")
+        days = f"its {plural(n, 'day')} are {counts.days[0]} to {counts.days[-1]}"
+        raise InputError(f"--from is {from_day}: {counts.source} has no usable readings from then on; {days}")
     settings = fit_settings(counts, first, counted(progress, "Fit", FIT_STEPS))
     week = shown_week(counts, first)
     models: list[Compared] = []
@@ -139,19 +137,33 @@ def evaluate(
     return _scored(plural(rows[0]["car_parks"], "car park"), summary, _faults(counts))
 
 
-def _evaluate_log(log: Path, folder: Path, from_day: date | None, seed: int, progress: Progress) -> FitReport:
-    recorded = OccupancyLog.read(log)
+def _told_faults(log: OccupancyLog) -> Row:
+    return {"faults": dict(log.faults)} if log.faults else {}
+
+
+def _log_faults(log: OccupancyLog) -> list[str]:
+    faults = ", ".join(f"{name.replace('_', ' ')} {n:,}" for name, n in log.faults.items())
+    return [f"Rows corrected or left out: {faults}"] if faults else []
+
+
+def _evaluate_log(
+    recorded: OccupancyLog, log: Path, folder: Path, from_day: date | None, seed: int, progress: Progress
+) -> FitReport:
     first = recorded.days[len(recorded.days) // 2] if from_day is None else str(from_day)
     classes = [np.flatnonzero(recorded.weekend == weekend) for weekend in (False, True)]
     days = [recorded.slot_days(days) for days in classes if days.size]
     done = counted(progress, "Forecast days", sum(day >= first for day in recorded.days))
     models: Sequence[ComparedSlots] = compare_slot_days(days, date.fromisoformat(first).toordinal(), done)
     if not models:
-        raise InputError(f"--from is {first}: {log} has no day from then on with one of its class before it")
+        there = f"its {plural(len(recorded.days), 'day')} are {', '.join(recorded.days):.60}"
+        raise InputError(
+            f"--from is {first}: {log} has no day from then on with one of its class before it; {there}"
+        )
     for compared in models:
         save_forecast(shown_slots(compared, log.name), folder / f"{compared.model}.png")
     rows = [_row(compared, models[0], seed) for compared in models]
-    return _scored(plural(len(recorded.slot_ids), "slot"), {"rows": rows, "first_day": first})
+    summary = {"rows": rows, "first_day": first, **_told_faults(recorded)}
+    return _scored(plural(len(recorded.slot_ids), "slot"), summary, _log_faults(recorded))
 
 
 def _scored(what: str, summary: Row, notes: Sequence[str] = ()) -> FitReport:

@@ -13,7 +13,7 @@ from pydantic import Field
 from parkenv.errors import InputError
 from parkenv.files.option import option
 from parkenv.files.spec_file import FilePath
-from parkenv.scenarios.spec import Date, PurposeSpec, scenario_spec
+from parkenv.scenarios.spec import TIMEZONE_HELP, Date, PurposeSpec, scenario_spec
 from parkenv.show.columns import Column
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
@@ -109,7 +109,7 @@ class DemandStudy(Study):
     episodes: int = option(
         3, "Days of the fleet in each round, and for each predicted day.", short="-n", ge=1, le=1_000
     )
-    timezone: str = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
+    timezone: str | None = option(None, TIMEZONE_HELP, takes="NAME", default="times are local")
     seed: Seed = Field(0, description="Seed of these days.")
 
     @cached_property

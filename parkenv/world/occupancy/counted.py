@@ -1,9 +1,11 @@
-"""Worlds that follow the hourly counts of a car park: its days, replayed on the slots of a lot."""
+"""Worlds that follow counts of car parks: hourly ones by a process; finer ones, and those of kerbs, by a log."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -11,13 +13,17 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, require
+from parkenv.files.known_names import SAME_SLOTS
+from parkenv.forecast.counts import Counts
+from parkenv.forecast.event_table import Events
 from parkenv.forecast.logistic_normal import NormalQuadrature
+from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY, PROCESS_KIND
-from parkenv.world.occupancy.log import weekday_of
+from parkenv.world.occupancy.log import OccupancyLog, weekday_of
 from parkenv.world.occupancy.process import (
     MAX_RATE,
     Arrival,
@@ -27,6 +33,7 @@ from parkenv.world.occupancy.process import (
     OccupancyProcess,
     ProcessWorld,
 )
+from parkenv.world.occupancy.recorded import read_mapping, some_mapped
 from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S
 
 LEAST, MOST = 0.002, 0.998
@@ -161,4 +168,70 @@ def process_of_curve(attraction: FloatArray, curve: FloatArray, mean_stay_s: flo
             p = later(arrivals[hour], departures[hour])
     return OccupancyProcess(
         pull, np.tile(np.exp(arrivals), 7), np.ones(pull.size), np.tile(np.exp(departures), 7)
+    )
+
+
+def car_park_of_slots(mapping: str | Path, lot: ParkingLot, counts: Counts) -> IntArray:
+    """Return the car park of each slot, (n,) index; -1 for none.
+
+    Args:
+        mapping: a file of slots and car parks, `slot_id,log_slot_id`; or `same`: the slots of a facility or a zone with
+            the name of a car park.
+        lot: the lot.
+        counts: the counts.
+    """
+    if mapping != SAME_SLOTS:
+        return read_mapping(mapping, lot.slot_ids, counts.car_parks, counts.source)
+    index = {name: i for i, name in enumerate(counts.car_parks)}
+    of_slot = np.full(lot.n_slots, -1, np.int64)
+    for names, places in (
+        (lot.zones, lot.zone_of_slot),
+        ([f.name for f in lot.facilities], lot.facility_of_slot),
+    ):
+        for k, name in enumerate(names):
+            if name in index:
+                of_slot[places == k] = index[name]
+    return some_mapped(of_slot, "mapping 'same': facility or zone", counts.car_parks, counts.source)
+
+
+MOST_GAP_S = 2 * HOUR_S
+"""Longest time between counts over which they say how full a car park is, s."""
+
+
+def log_of_counts(
+    counts: Counts, car_park: IntArray, slot_ids: Sequence[str], attraction: FloatArray
+) -> OccupancyLog:
+    """Return a log in which, from each count on, as many slots of a car park are taken as it says of its slots.
+
+    No more cars come or go than the counts say: where they rise, cars take free slots, popular ones more often; where
+    they fall, any of them leave.
+
+    Args:
+        counts: the counts.
+        car_park: (n,) int64, car park of each slot; -1 for none.
+        slot_ids: (n,) names of the slots.
+        attraction: (n,) float64, logit, popularity of the slots.
+    """
+    spans = list[tuple[int, float, float, bool]]()
+    for park in np.unique(car_park[car_park >= 0]).tolist():
+        slots, rng = np.flatnonzero(car_park == park), np.random.default_rng(park)
+        second, occupied = counts.readings(park)
+        taken, since = np.zeros(slots.size, bool), second[:1].repeat(slots.size)
+        for k, wanted in enumerate(np.round(occupied * slots.size).astype(int).tolist()):
+            if k and second[k] - second[k - 1] > MOST_GAP_S:
+                spans += zip(slots, since, second[k - 1].repeat(slots.size), taken.copy(), strict=True)
+                since[:] = second[k]
+            comes = wanted > taken.sum()
+            among = np.flatnonzero(taken != comes)
+            race = rng.exponential(size=among.size) * (np.exp(-attraction[slots[among]]) if comes else 1.0)
+            for slot in among[np.argsort(race)[: abs(wanted - int(taken.sum()))]]:
+                spans.append((slots[slot], since[slot], second[k], not comes))
+                taken[slot], since[slot] = comes, second[k]
+        spans += zip(slots, since, second[-1:].repeat(slots.size), taken, strict=True)
+    table = np.array([span for span in spans if span[2] > span[1]]).reshape(-1, 4)
+    require(table.size, f"{counts.source}: no counts in a row of the lot's car parks, want some")
+    table = table[np.lexsort((table[:, 1], table[:, 0]))]
+    columns = table[:, 0].astype(np.int64), table[:, 1], table[:, 2], table[:, 3] > 0
+    return OccupancyLog.of_events(
+        Events(tuple(slot_ids), counts.days[0].toordinal(), *columns, {}), source=counts.source
     )

@@ -203,6 +203,7 @@ def fit_process(log: OccupancyLog, max_gap_s: float = 7200.0, prior_sd: float = 
     the morning is right. A class of day that was never observed gets the other's profile.
     """
     require_number("prior_sd", prior_sd, above=0.0)
+    log = log.looks
     pairs = log.intervals(max_gap_s)
     require(pairs.slot.size, f"{log.source}: no two observations of a slot on one day within {max_gap_s:g} s")
     n = len(log.slot_ids)

@@ -87,11 +87,8 @@ WORLD = np.dtype(WORLD_FIELDS, align=True)
 RECORDED_DAY = np.dtype(
     [
         ("midnight", np.float64),  # s since Monday 00:00
-        # Arrays of `MappedLog`, `ReplayForecast` and `OccupancyLog`.
-        *(
-            (name, ADDRESS)
-            for name in ("record", "log_odds", "day_level", "decay_rate", "first", "from_s", "occupied")
-        ),
+        # Arrays of `ReplayForecast` and `DayStates`.
+        *((name, ADDRESS) for name in ("log_odds", "day_level", "decay_rate", "first", "from_s", "occupied")),
     ],
     align=True,
 )
@@ -448,16 +445,14 @@ def keep_hourly_marginals(process: Any, hour: int) -> None:
 
 @inlined
 def recorded_index(day: Any, slot: int, second: float) -> int:
-    record = int64s(day.record)[slot]
-    begin, end = int64s(day.first)[record], int64s(day.first)[record + 1]
+    begin, end = int64s(day.first)[slot], int64s(day.first)[slot + 1]
     return int(begin + _count_below(day.from_s, begin, end, second, True) - 1)
 
 
 @kernel
 def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
     k = recorded_index(day, slot, time - day.midnight)
-    record = int64s(day.record)[slot]
-    last = k + 1 >= int64s(day.first)[record + 1]
+    last = k + 1 >= int64s(day.first)[slot + 1]
     cursor.occupied = uint8s(day.occupied)[k] != 0
     cursor.valid_until = np.inf if last else float64s(day.from_s)[k + 1] + day.midnight - _MOMENT_S
     return bool(cursor.occupied)
@@ -466,7 +461,7 @@ def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
 @kernel
 def recorded_changes(day: Any, slot: int, second: float) -> int:
     taken, changes = uint8s(day.occupied), 0
-    for k in range(int64s(day.first)[int64s(day.record)[slot]] + 1, recorded_index(day, slot, second) + 1):
+    for k in range(int64s(day.first)[slot] + 1, recorded_index(day, slot, second) + 1):
         changes += taken[k] != taken[k - 1]
     return changes
 

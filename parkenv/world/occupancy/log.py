@@ -1,14 +1,15 @@
-"""Recorded occupancy: a log of observations of slots.
+"""Recorded occupancy: a log of states of slots.
 
-Between observations the last known state holds; in a gap longer than `max_gap_s`, the state of the observation nearest
-in time. Before a day's first observation the first state holds, after its last observation the last one. A slot that
-was not observed on a day has no record of that day.
+A state that was observed holds until the next observation of the slot on that day, or until `until` where a log knows
+how long (see `parkenv.forecast.event_table`). Longer gaps than `max_gap_s` between observations are unknown, as is the
+time before a day's first observation and after its last. A slot that was not observed on a day has no record of it.
 """
 
-import os
-from collections.abc import Callable, Iterator, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from datetime import date, datetime
+from datetime import date
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self, TypeVar, get_args
@@ -19,7 +20,9 @@ from numpy.typing import ArrayLike
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError, require, require_number, require_one_of
-from parkenv.files.limited_reading import csv_rows
+from parkenv.forecast.count_table import Capacity
+from parkenv.forecast.counts import Counts
+from parkenv.forecast.event_table import Events, is_counts, read_events
 from parkenv.forecast.slot_days import Days, SlotDays
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, PERIOD_S
 
@@ -28,12 +31,8 @@ DayClass = Literal["weekday", "weekend"]
 MAX_GAP_S = 7200.0
 SAMPLE_S = 900.0
 """Time between the pairs of observations of a log that has each change, s."""
-MAX_LOG_BYTES = 512_000_000
-"""Maximum size of a log, unpacked: some 12 million observations."""
 MAX_RECORDS = 5_000_000
 """Maximum number of slots times days of a log, each of which takes half a kilobyte."""
-
-_KNOWN = ("datetime", "camera", "slot_id", "weather", "occupied")
 
 
 def weekday_of(day: str) -> int:
@@ -78,6 +77,25 @@ class _Periods(NamedTuple):
     seen: FloatArray
 
 
+class RecordedFile(NamedTuple):
+    """A file of counts, or logs of bays, and how they are read; see `Counts.read` and `OccupancyLog.read`."""
+
+    files: tuple[Path, ...]
+    timezone: str | None = None
+    capacity: Capacity = None
+    columns: str | None = None
+
+    @property
+    def is_counts(self) -> bool:
+        return is_counts(self.files[0], self.columns)
+
+    def counts(self) -> Counts:
+        return Counts.read(self.files[0], self.timezone, self.capacity, self.columns)
+
+    def log(self) -> OccupancyLog:
+        return OccupancyLog.read(*self.files, timezone=self.timezone, columns=self.columns)
+
+
 _Model = TypeVar("_Model")
 
 
@@ -95,8 +113,11 @@ class OccupancyLog:
         day: (k,) int64, index of the day.
         second: (k,) float64, s since that day's midnight, in [0, 86400).
         occupied: (k,) bool, observed state.
-        max_gap_s: s, longest gap over which the last known state holds to the end.
+        max_gap_s: s, longest gap between observations over which the last state holds.
         source: name of the log in error messages.
+        known_until: (k,) float64, s of the day up to which the state is known to hold; by default until the next
+            observation, if that is near enough, or if the log has both states of each change, within a second.
+        faults: how much of its file is not in the log, or changed, by rule (see `parkenv.forecast.event_table`).
     """
 
     slot_ids: tuple[str, ...]
@@ -107,9 +128,14 @@ class OccupancyLog:
     occupied: BoolArray
     max_gap_s: float = MAX_GAP_S
     source: str = "occupancy log"
-    # Record r = day * n_slots + slot: observations first[r] to first[r + 1]. Each state holds from from_s on.
+    known_until: FloatArray = field(default_factory=lambda: np.zeros(0))
+    faults: Mapping[str, int] = field(default_factory=dict)
+    # Record r = day * n_slots + slot: observations first[r] to first[r + 1].
     first: IntArray = field(init=False, repr=False)
-    from_s: FloatArray = field(init=False, repr=False)
+    until: FloatArray = field(init=False, repr=False)  # (k,) s of the day up to which the state is known
+    continuous: bool = field(
+        init=False, repr=False
+    )  # whether states are known between observations, however far
     _models: dict[tuple[Any, ...], Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -137,74 +163,28 @@ class OccupancyLog:
         order, record = order[stands], record[stands]
         slot, day, second, occupied = slot[order], day[order], second[order], occupied[order]
         first = np.searchsorted(record, np.arange(len(self.slot_ids) * len(self.days) + 1))
-        gap = np.diff(second, prepend=second[0])
-        # In a long gap the state changes half-way, where the later observation becomes the nearer one.
-        from_s = np.where(gap > self.max_gap_s, second - gap / 2, second)
-        from_s[np.diff(record, prepend=-1) > 0] = 0.0
+        same = np.append(np.diff(record) == 0, False)
+        following = np.where(same, np.append(second[1:], 0.0), DAY_S)
+        changes = same & (np.append(occupied[1:], False) != occupied)
+        each_change = bool(changes.any()) and float((following - second)[changes].max()) <= 1.001
+        continuous = each_change or np.size(self.known_until) > 0
+        if np.size(self.known_until):
+            require(
+                np.shape(self.known_until) == stands.shape,
+                f"{self.source}: known_until: want one for each observation",
+            )
+            until = np.clip(np.asarray(self.known_until, float)[order], second, following)
+            object.__setattr__(self, "known_until", until)
+        else:
+            until = np.where(same & (each_change | (following - second <= self.max_gap_s)), following, second)
         arrays = {"slot": slot, "day": day, "second": second, "occupied": occupied}
-        for name, array in (arrays | {"first": first, "from_s": from_s}).items():
+        for name, array in (arrays | {"first": first, "until": until}).items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        object.__setattr__(self, "continuous", continuous)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "OccupancyLog":
+    def __deepcopy__(self, memo: dict[int, Any]) -> OccupancyLog:
         return self  # immutable: copies share it
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str], max_gap_s: float = MAX_GAP_S) -> Self:
-        """Read a CSV file, gzipped if its name ends in `.gz`.
-
-        Columns: `datetime` (ISO, local time), `slot_id`, `occupied` (0 or 1); `camera` and `weather` are allowed and
-        ignored. Several cameras may observe a slot; its observations must be in order of time.
-
-        Raises:
-            InputError: names the file, and the line and value where there is one.
-        """
-        path = Path(path)
-        slots: dict[str, int] = {}
-        moments: dict[str, datetime] = {}  # one image shows many slots: many lines have the same text
-        latest: dict[str, datetime] = {}
-        observations: list[tuple[int, datetime, bool]] = []
-        rows = csv_rows(path, MAX_LOG_BYTES)
-        at_time, at_slot, at_occupied = csv_columns(path, rows, _KNOWN, ("datetime", "slot_id", "occupied"))
-        for line, row in rows:
-            text, slot_id, taken = row[at_time], row[at_slot], row[at_occupied]
-            moment = moments.get(text)
-            if moment is None:
-                moment = moments[text] = _moment(path, line, text)
-            if not slot_id:
-                raise InputError(f"{path}: line {line}: slot_id: empty, want a slot's name")
-            if taken not in ("0", "1"):
-                raise InputError(f"{path}: line {line}: occupied is {taken!r}, want 0 or 1")
-            if moment < latest.get(slot_id, moment):
-                raise InputError(
-                    f"{path}: line {line}: datetime: {text} of slot {slot_id} is before its line above,"
-                    f" {latest[slot_id]}; want observations in order of time"
-                )
-            latest[slot_id] = moment
-            observations.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
-        if not observations:
-            raise InputError(f"{path}: no observations, want at least one line below the header")
-        dates = [moment.date().isoformat() for _, moment, _ in observations]
-        days = sorted(set(dates))
-        day_index = {day: i for i, day in enumerate(days)}
-        seconds = [
-            m.hour * 3600 + m.minute * 60 + m.second + m.microsecond * 1e-6 for _, m, _ in observations
-        ]
-        slot, occupied = (np.array([each[k] for each in observations]) for k in (0, 2))
-        day = np.array([day_index[day] for day in dates])
-        return cls(tuple(slots), tuple(days), slot, day, np.array(seconds), occupied, max_gap_s, str(path))
-
-    @classmethod
-    def read_all(cls, paths: Sequence[str | os.PathLike[str]]) -> Self:
-        """Read logs of the same slots on different days as one log.
-
-        Raises:
-            InputError: as `read`; or other slots than in the first log, or a day of an earlier one.
-        """
-        log = cls.read(paths[0])
-        for path in paths[1:]:
-            log = log._with(cls.read(path))
-        return log
 
     def fitted(self, what: str, days: IntArray, fit: Callable[[IntArray], _Model]) -> _Model:
         """Return a model of some of the days: fitted once, however many scenarios replay the log."""
@@ -213,30 +193,43 @@ class OccupancyLog:
             self._models[key] = fit(days)
         return self._models[key]  # type: ignore[no-any-return]
 
-    def _with(self, other: Self) -> Self:
-        odd = set(self.slot_ids) ^ set(other.slot_ids)
-        if odd:
-            raise InputError(
-                f"{other.source}: slot_id: {min(odd)!r} is in one of this log and {self.source} only,"
-                " want the same slots"
-            )
-        twice = set(self.days) & set(other.days)
-        if twice:
-            raise InputError(f"{other.source}: {min(twice)} is also in {self.source}, want different days")
-        days = sorted({*self.days, *other.days})
-        slot = {slot_id: i for i, slot_id in enumerate(self.slot_ids)}
-        slots = np.array([slot[slot_id] for slot_id in other.slot_ids], np.int64)
-        day = [np.searchsorted(days, log.days)[log.day] for log in (self, other)]
-        return type(self)(
-            self.slot_ids,
-            tuple(days),
-            np.concatenate([self.slot, slots[other.slot]]),
-            np.concatenate(day),
-            np.concatenate([self.second, other.second]),
-            np.concatenate([self.occupied, other.occupied]),
-            self.max_gap_s,
-            f"{self.source},{other.source}",
-        )
+    @classmethod
+    def read(
+        cls,
+        *paths: str | Path,
+        timezone: str | None = None,
+        columns: str | None = None,
+        max_gap_s: float = MAX_GAP_S,
+    ) -> Self:
+        """Read tables of bays, .csv or .csv.gz, in any layout of `parkenv.forecast.event_table`, as one log.
+
+        Args:
+            paths: the tables.
+            timezone: IANA name of the local time zone, wanted if times are in UTC or have an offset.
+            columns: names of columns that are not recognised, `bay=Marker,...`.
+            max_gap_s: s, longest gap between observations over which the last state holds.
+
+        Raises:
+            InputError: names the file, and the line and value where there is one.
+        """
+        source = ",".join(map(str, paths))
+        return cls.of_events(read_events(paths, timezone, columns), max_gap_s, source)
+
+    @classmethod
+    def of_events(cls, events: Events, max_gap_s: float = MAX_GAP_S, source: str = "occupancy log") -> Self:
+        """Return the events day by day: what lasts over midnight is known on both days."""
+        are_looks = not (events.end > events.start).any()
+        begin, last = events.start // DAY_S, np.ceil(events.end / DAY_S) - 1
+        n = np.maximum(last - begin, 0).astype(np.int64) + 1
+        which = np.repeat(np.arange(n.size), n)
+        number = begin[which] + np.arange(which.size) - np.repeat(np.cumsum(n) - n, n)
+        second = np.maximum(events.start[which] - number * DAY_S, 0.0)
+        until = np.minimum(events.end[which] - number * DAY_S, DAY_S)
+        days, day = np.unique(number.astype(np.int64), return_inverse=True)
+        dates = tuple(date.fromordinal(events.first + day).isoformat() for day in days.tolist())
+        known = np.zeros(0) if are_looks else until
+        parts = events.bay[which], day, second, events.taken[which], max_gap_s, source, known, events.faults
+        return cls(events.bays, dates, *parts)
 
     @cached_property
     def weekend(self) -> BoolArray:
@@ -244,43 +237,38 @@ class OccupancyLog:
         return np.array([day_class(day) == "weekend" for day in self.days], bool)
 
     def intervals(self, max_gap_s: float = MAX_GAP_S) -> Intervals:
-        """Return the pairs of consecutive observations of one slot on one day, at most `max_gap_s` apart.
-
-        Where observations follow from changes, as in days of a fleet, they would say that states change within a
-        second. The pairs of such a log are `SAMPLE_S` apart, at times that do not depend on the states.
-        """
-        same_record = np.diff(self._record) == 0
-        changes = same_record & (np.diff(self.occupied.astype(np.int8)) != 0)
-        if changes.any() and np.diff(self.second)[changes].max() <= 1.0:  # a log of each change
-            return self._samples(min(SAMPLE_S, max_gap_s))
-        earlier = np.flatnonzero(same_record & (np.diff(self.second) <= max_gap_s))
+        """Return the pairs of consecutive observations of one slot on one day, at most `max_gap_s` apart."""
+        log = self.looks
+        same_record = np.diff(log.day * len(log.slot_ids) + log.slot) == 0
+        earlier = np.flatnonzero(same_record & (np.diff(log.second) <= max_gap_s))
         later = earlier + 1
-        slot, day = self.slot[earlier], self.day[earlier]
+        slot, day = log.slot[earlier], log.day[earlier]
         return Intervals(
-            slot, day, self.second[earlier], self.second[later], self.occupied[earlier], self.occupied[later]
+            slot, day, log.second[earlier], log.second[later], log.occupied[earlier], log.occupied[later]
         )
 
-    @property
-    def _record(self) -> IntArray:
-        return self.day * len(self.slot_ids) + self.slot
+    @cached_property
+    def looks(self) -> Self:
+        """This log with observations at times that do not depend on the states.
 
-    def _samples(self, each_s: float) -> Intervals:
-        grid = np.arange(0.0, DAY_S, each_s)
-        observed = np.flatnonzero(np.diff(self.first))
-        begin, end = self.second[self.first[observed]], self.second[self.first[observed + 1] - 1]
-        which, at = np.nonzero((grid >= begin[:, None]) & (grid + each_s <= end[:, None]))
-        day, slot = np.divmod(observed[which], len(self.slot_ids))
-        start, key = grid[at], self._record * DAY_S + self.second
-        before, after = (
-            self.occupied[np.searchsorted(key, observed[which] * DAY_S + second, side="right") - 1]
-            for second in (start, start + each_s)
-        )
-        return Intervals(slot, day, start, start + each_s, before, after)
+        Where observations follow from changes they would say that states change within a second: of such a log the
+        states every `SAMPLE_S` are taken instead, where they are known.
+        """
+        if not self.continuous:
+            return self
+        grid = np.arange(0.0, DAY_S, SAMPLE_S)
+        low, high = np.searchsorted(grid, self.second), np.searchsorted(grid, self.until)
+        which = np.repeat(np.arange(low.size), high - low)
+        if not which.size:
+            return self
+        at = np.arange(which.size) - np.repeat(np.cumsum(high - low) - high, high - low)
+        parts = self.slot[which], self.day[which], grid[at], self.occupied[which]
+        return type(self)(self.slot_ids, self.days, *parts, self.max_gap_s, self.source)
 
     def mean_occupancy(
         self, kind: DayClass, hours: tuple[int, int] = (0, DAY_HOURS), days: BoolArray | None = None
     ) -> FloatArray:
-        """Return the fraction of time each slot was taken, between the days' first and last observations.
+        """Return the fraction of the known time in which each slot was taken.
 
         Args:
             kind: class of the days.
@@ -306,16 +294,17 @@ class OccupancyLog:
     def slot_days(self, days: IntArray) -> SlotDays:
         """Return the states of the slots in half-hours on `days`, (d,) indices.
 
-        A state counts from one observation to the next, the last one of a day to the end of its half-hour.
+        A state counts while it is known; one that is known at a moment only, to the end of its half-hour.
         """
         occupied, seen = (seconds.copy() for seconds in self._periods)
-        record = np.flatnonzero(np.diff(self.first))
-        day, slot = np.divmod(record, len(self.slot_ids))
-        last = self.first[record + 1] - 1
+        last = np.flatnonzero(self.until == self.second)
         period = (self.second[last] // PERIOD_S).astype(np.int64)
         rest = (period + 1) * PERIOD_S - self.second[last]
-        seen[slot, day, period] += rest
-        occupied[slot, day, period] += np.where(self.occupied[last], rest, 0.0)
+        cell = self.slot[last], self.day[last], period
+        np.add.at(seen, cell, rest)
+        np.add.at(occupied, cell, np.where(self.occupied[last], rest, 0.0))
+        np.minimum(seen, PERIOD_S, out=seen)
+        np.minimum(occupied, seen, out=occupied)
         seen, occupied = seen[:, days], occupied[:, days]
         taken = np.divide(occupied, seen, out=np.zeros(seen.shape), where=seen > 0)
         return SlotDays(self.dates(days), taken, seen / PERIOD_S)
@@ -332,7 +321,7 @@ class OccupancyLog:
     def _periods(self) -> _Periods:
         shape = (len(self.slot_ids), len(self.days), DAY_PERIODS)
         periods = _Periods(np.zeros(shape), np.zeros(shape))
-        _sum_periods(self.first, self.from_s, self.second, self.occupied, *periods)
+        _sum_periods(self.slot, self.day, self.second, self.until, self.occupied, *periods)
         return periods
 
 
@@ -348,44 +337,15 @@ def _add_seconds(periods: FloatArray, start: float, end: float) -> None:
 
 @compiled
 def _sum_periods(
-    first: IntArray,
-    from_s: FloatArray,
+    slot: IntArray,
+    day: IntArray,
     second: FloatArray,
+    until: FloatArray,
     taken: BoolArray,
     occupied: FloatArray,
     seen: FloatArray,
 ) -> None:
-    n_slots = seen.shape[0]
-    for record in range(first.size - 1):
-        day, slot = record // n_slots, record % n_slots
-        last = first[record + 1] - 1
-        for i in range(first[record], last + 1):
-            start, end = from_s[i], DAY_S if i == last else from_s[i + 1]
-            watched, left = max(start, second[first[record]]), min(end, second[last])
-            _add_seconds(seen[slot, day], watched, left)
-            if taken[i]:
-                _add_seconds(occupied[slot, day], watched, left)
-
-
-def csv_columns(
-    path: Path, rows: Iterator[tuple[int, list[str]]], known: Sequence[str], needed: Sequence[str]
-) -> list[int]:
-    _, header = next(rows, (0, []))
-    require(header, f"{path}: empty, want a header with the columns {', '.join(needed)}")
-    for name in header:
-        require(name in known, f"{path}: column {name!r} is unknown, want some of {', '.join(known)}")
-        require(header.count(name) <= 1, f"{path}: column {name!r} stands there twice, want it once")
-    for name in needed:
-        require(name in header, f"{path}: column {name!r} is missing, want {', '.join(needed)}")
-    return [header.index(name) for name in needed]
-
-
-def _moment(path: Path, line: int, text: str) -> datetime:
-    wanted = "want local date and time, for example 2015-11-12 07:09"
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        moment = None
-    if moment is None or ":" not in text or moment.tzinfo is not None:
-        raise InputError(f"{path}: line {line}: datetime is {text!r}, {wanted}")
-    return moment
+    for i in range(slot.size):
+        _add_seconds(seen[slot[i], day[i]], second[i], until[i])
+        if taken[i]:
+            _add_seconds(occupied[slot[i], day[i]], second[i], until[i])

@@ -19,12 +19,13 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of, float64s, int64s, uint8s
 from parkenv.errors import InputError, require, require_one_of
 from parkenv.files.field_types import as_array
-from parkenv.files.known_names import FORECAST_FROM, ForecastFrom
+from parkenv.files.known_names import FORECAST_FROM, SAME_SLOTS, ForecastFrom
 from parkenv.files.limited_reading import csv_rows
 from parkenv.forecast.slot_days import MAX_DAYS, fit_slot_days
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError
 from parkenv.world.occupancy.fit import fit_hourly_decay_rates
+from parkenv.world.occupancy.gaps import DayStates, day_states
 from parkenv.world.occupancy.kernel import (
     LOG_KIND,
     MAX_PROBABILITY,
@@ -37,7 +38,7 @@ from parkenv.world.occupancy.kernel import (
     recorded_forecast,
     recorded_index,
 )
-from parkenv.world.occupancy.log import OccupancyLog, csv_columns, day_class, weekday_of
+from parkenv.world.occupancy.log import OccupancyLog, day_class, weekday_of
 from parkenv.world.occupancy.process import (
     Arrival,
     CompiledModel,
@@ -48,29 +49,42 @@ from parkenv.world.occupancy.process import (
 )
 from parkenv.world.week import DAY_S
 
+_SOME = 0.1  # of the most slots that a day has, which a day needs at least to be replayed
 
-def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
+
+def read_mapping(
+    path: str | os.PathLike[str], lot_slot_ids: Sequence[str], names: Sequence[str], source: str
+) -> IntArray:
+    """Return the log's slot of each slot of the lot, (n,) indices of its `names`; -1 for those without a record.
+
+    Raises:
+        InputError: names the file, the line and the value; or none has a record.
+    """
     path = Path(path)
-    log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
+    log_index = {slot_id: i for i, slot_id in enumerate(names)}
     lot_index = {slot_id: i for i, slot_id in enumerate(lot_slot_ids)}
+    seen = set[str]()
     mapping = np.full(len(lot_slot_ids), -1, np.int64)
     rows = csv_rows(path)
-    at_slot, at_log_slot = csv_columns(path, rows, ("slot_id", "log_slot_id"), ("slot_id", "log_slot_id"))
+    _, header = next(rows, (0, []))
+    if sorted(header) != ["log_slot_id", "slot_id"]:
+        raise InputError(f"{path}: has the columns {', '.join(header)!r:.120}, want slot_id,log_slot_id")
+    at_slot, at_log_slot = header.index("slot_id"), header.index("log_slot_id")
     for line, row in rows:
         slot_id, log_slot_id = row[at_slot], row[at_log_slot]
         if slot_id not in lot_index:
             raise InputError(f"{path}: line {line}: slot_id is {slot_id!r}, want a slot of the lot")
-        if mapping[lot_index[slot_id]] >= 0:
+        if slot_id in seen:
             raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, want it once")
-        if log_slot_id not in log_index:
-            raise InputError(
-                f"{path}: line {line}: log_slot_id is {log_slot_id!r}, want a slot of {log.source}"
-            )
-        mapping[lot_index[slot_id]] = log_index[log_slot_id]
-    missing = [slot_id for slot_id, i in lot_index.items() if mapping[i] < 0]
-    if missing:
+        seen.add(slot_id)
+        mapping[lot_index[slot_id]] = log_index.get(log_slot_id, -1)
+    return some_mapped(mapping, f"{path}: log_slot_id", names, source)
+
+
+def some_mapped(mapping: IntArray, what: str, names: Sequence[str], source: str) -> IntArray:
+    if not (mapping >= 0).any():
         raise InputError(
-            f"{path}: slot_id: {len(missing)} slots of the lot have no line, the first is {missing[0]!r}"
+            f"{what}: none is among the {len(names):,} names of {source}, whose first is {names[0]!r:.60}"
         )
     return mapping
 
@@ -86,11 +100,8 @@ def _decay_rates(log: OccupancyLog, days: IntArray) -> FloatArray:
 
 def same_slots(lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
-    if missing := [slot_id for slot_id in lot_slot_ids if slot_id not in log_index]:
-        raise InputError(
-            f"{log.source}: has no slot {missing[0]!r} of the lot (and {len(missing) - 1} more), want the same names"
-        )
-    return np.array([log_index[slot_id] for slot_id in lot_slot_ids], np.int64)
+    mapping = np.array([log_index.get(slot_id, -1) for slot_id in lot_slot_ids], np.int64)
+    return some_mapped(mapping, f"mapping {SAME_SLOTS!r}: slot", log.slot_ids, log.source)
 
 
 @kernel
@@ -103,7 +114,7 @@ def _query(
     """
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
-        k, end = recorded_index(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
+        k, end = recorded_index(day, slots[i], second), int64s(day.first)[slots[i] + 1]
         occupied[i], free_from[i] = uint8s(day.occupied)[k] != 0, second
         changes[i] = recorded_changes(day, slots[i], second)
         while k < end and uint8s(day.occupied)[k] != 0:
@@ -156,8 +167,8 @@ class RecordedWorld(World):
 class MappedLog(NamedTuple):
     """The log mapped to the lot for one replayed day, independent of the time of arrival."""
 
-    log_slot: IntArray  # (n,)
-    record: IntArray  # (n,)
+    log_slot: IntArray  # (n,); -1: no record
+    record: IntArray  # (n,); -1: none
     held_out: frozenset[int]  # days that the world replays; the forecast must not use them
     known: IntArray  # (k,) days that it is made from
     replayed: IntArray  # (n,) day that each slot replays
@@ -181,14 +192,18 @@ class RecordedOccupancy(OccupancyModel):
 
     The days that a world replays are not used to map or forecast it; nor, unless with `others`, is any later day.
 
+    What the record does not know is drawn from the forecast's law, the same on a day for every episode (see
+    `parkenv.world.occupancy.gaps`). So is a slot without a record, with the mean forecast of the slots of its group.
+
     Args:
         log: the recorded observations.
         walk_m: (n,) float64, m, walking distance from each slot to the goal.
-        mapping: (n,) int64, log slot of each lot slot, instead of this rule (see `read_mapping`).
+        mapping: (n,) int64, log slot of each lot slot, -1 for none, instead of this rule (see `read_mapping`).
         replay_from: first day that is replayed; all days by default.
         forecast_from: the days of the arrival's class that the forecast and the ranks are made from: `others`, all
             that the world does not replay; `rolling`, those before the earliest that the world replays; `past`, those
             before `replay_from`. The last two need a `replay_from`.
+        group: (n,) int64, group of each slot, such as its facility; one by default.
     """
 
     kind: ClassVar[int] = LOG_KIND
@@ -199,8 +214,10 @@ class RecordedOccupancy(OccupancyModel):
     mapping: IntArray | None = None
     replay_from: date | None = None
     forecast_from: ForecastFrom = "others"
+    group: IntArray | None = None
     _mapped_logs: dict[int, MappedLog] = field(init=False, repr=False, default_factory=dict)
     _forecasts: dict[int, ReplayForecast] = field(init=False, repr=False, default_factory=dict)
+    _states: dict[int, DayStates] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "walk_m", as_array("walk_m", self.walk_m, -1, least=0.0))
@@ -209,8 +226,8 @@ class RecordedOccupancy(OccupancyModel):
                 as_array("mapping", self.mapping, self.n_slots, dtype=np.int64),
                 len(self.log.slot_ids),
             )
-            if mapping.min() < 0 or mapping.max() >= m:
-                raise InputError(f"mapping: want ({self.n_slots},) indices of log slots from 0 to {m - 1}")
+            if mapping.min() < -1 or mapping.max() >= m:
+                raise InputError(f"mapping: want ({self.n_slots},) indices of log slots from -1 to {m - 1}")
             object.__setattr__(self, "mapping", mapping)
         require_one_of("forecast_from", self.forecast_from, FORECAST_FROM)
         if self.replay_from is None and self.forecast_from != "others":
@@ -242,7 +259,14 @@ class RecordedOccupancy(OccupancyModel):
         return CompiledModel(self.day_records(self.days_in(window)), {}, (self,))
 
     def days_in(self, window: ArrivalWindow) -> list[str]:
-        days = [day for day in self.log.days[self._first :] if weekday_of(day) in window.weekdays]
+        n = self.log.recorded.sum(axis=0)  # a day of which a few slots alone are known is none to search on
+        days = [
+            day
+            for day, recorded in zip(
+                self.log.days[self._first :], n[self._first :] >= _SOME * n.max(), strict=True
+            )
+            if recorded and weekday_of(day) in window.weekdays
+        ]
         if not days:
             names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
             since = "" if self.replay_from is None else f" from {self.replay_from} on"
@@ -268,14 +292,13 @@ class RecordedOccupancy(OccupancyModel):
 
     def day_records(self, days: Sequence[str], forecast: bool = True) -> NDArray[np.void]:
         """Return recorded days for compiled code, (k,) of the dtype RECORDED_DAY; valid while this object lives."""
-        log = self.log
         records = np.zeros(len(days), RECORDED_DAY)
         for record, day in zip(records, days, strict=True):
             record["midnight"] = weekday_of(day) * DAY_S
-            record["record"] = address_of(self.mapped_log(day).record, np.int64)
-            record["first"] = address_of(log.first, np.int64)
-            record["from_s"] = address_of(log.from_s, np.float64)
-            record["occupied"] = address_of(log.occupied, np.bool_)
+            states = self.day_states(day)
+            record["first"] = address_of(states.first, np.int64)
+            record["from_s"] = address_of(states.from_s, np.float64)
+            record["occupied"] = address_of(states.occupied, np.bool_)
             if forecast:
                 for name, values in self.day_forecast(day)._asdict().items():
                     record[name] = address_of(values, np.float64)
@@ -306,12 +329,22 @@ class RecordedOccupancy(OccupancyModel):
         while True:
             known = self._known(same_class, held_out)
             log_slot = self._assign(log.days[day], known) if self.mapping is None else self.mapping
-            days = self._replay_days(log_slot, replay_order)
+            days, log_slot = self._replay_days(log_slot, replay_order)
             # Replayed days must not affect the ranks: rank again without them.
             if held_out.issuperset(days):
                 break
             held_out.update(days)
-        return MappedLog(log_slot, days * len(log.slot_ids) + log_slot, frozenset(held_out), known, days)
+        record = np.where(log_slot < 0, -1, days * len(log.slot_ids) + log_slot)
+        return MappedLog(log_slot, record, frozenset(held_out), known, days)
+
+    def day_states(self, day: str) -> DayStates:
+        """Return the states of the lot's slots in the replay of `day`, a day of the log."""
+        index = self.log.days.index(day)
+        if index not in self._states:
+            forecast, rng = self.day_forecast(day), np.random.default_rng(date.fromisoformat(day).toordinal())
+            law = forecast.log_odds, forecast.decay_rate
+            self._states[index] = day_states(self.log, self.mapped_log(day).record, *law, rng)
+        return self._states[index]
 
     def day_forecast(self, day: str) -> ReplayForecast:
         """Return the forecast of the lot for the replay of `day`, a day of the log."""
@@ -345,6 +378,12 @@ class RecordedOccupancy(OccupancyModel):
         share = np.bincount(which) / which.size
         level = np.sqrt(np.einsum("j,pjk,k->p", share, forecast.level_covariance, share))
         p = np.clip(forecast.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
+        recorded = mapped.log_slot >= 0
+        if not recorded.all():
+            p[~recorded] = p[recorded].mean(axis=0) if recorded.any() else forecast.p_taken[0].mean(axis=0)
+            for group in np.unique(self.group[~recorded]) if self.group is not None else ():
+                if (alike := recorded & (self.group == group)).any():
+                    p[~recorded & (self.group == group)] = p[alike].mean(axis=0)
         return ReplayForecast(np.ascontiguousarray(logit(p)), np.minimum(level, MAX_LOGITS), rates)
 
     def _assign(self, day: str, known: IntArray) -> IntArray:
@@ -356,13 +395,17 @@ class RecordedOccupancy(OccupancyModel):
         log_slot[np.argsort(self.walk_m, kind="stable")] = np.argsort(-mean, kind="stable")[ranks]
         return log_slot
 
-    def _replay_days(self, log_slot: IntArray, replay_order: IntArray) -> IntArray:
+    def _replay_days(self, log_slot: IntArray, replay_order: IntArray) -> tuple[IntArray, IntArray]:
         recorded = self.log.recorded[:, replay_order]
         since = "" if self.replay_from is None else f" from {self.replay_from} on"
         days = np.empty(self.n_slots, np.int64)
-        left = {int(s): iter(replay_order[recorded[s]]) for s in np.unique(log_slot)}
+        left = {int(s): iter(replay_order[recorded[s]]) for s in np.unique(log_slot[log_slot >= 0])}
+        if self.mapping is not None:  # a slot whose own day is not recorded has no record
+            log_slot = np.where((log_slot >= 0) & recorded[log_slot, 0], log_slot, -1)
         for slot in np.argsort(self.walk_m, kind="stable"):
-            chosen = next(left[int(log_slot[slot])], None)
+            chosen = replay_order[0] if log_slot[slot] < 0 else next(left[int(log_slot[slot])], None)
+            if chosen is None and self.mapping is not None:
+                chosen, log_slot[slot] = replay_order[0], -1
             if chosen is None:
                 name = self.log.slot_ids[log_slot[slot]]
                 n_copies, n_days = (log_slot == log_slot[slot]).sum(), recorded[log_slot[slot]].sum()
@@ -371,4 +414,4 @@ class RecordedOccupancy(OccupancyModel):
                     f" on {n_days} days of the class{since}; want a smaller lot or a longer log"
                 )
             days[slot] = chosen
-        return days
+        return days, log_slot

@@ -1,0 +1,205 @@
+"""Tables of single bays: their layouts, their faults, and what fills their gaps."""
+
+import contextlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from parkenv import InputError
+from parkenv.forecast.counts import Counts
+from parkenv.forecast.event_table import is_counts, read_events
+from parkenv.world.occupancy.counted import log_of_counts
+from parkenv.world.occupancy.gaps import day_states
+from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.week import DAY_S, HOUR_S
+
+DAY = "2024-05-06"
+
+
+def table(tmp_path, text, name="log.csv"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def spans(path, **options):
+    """Bay, begin, end (h of the first day) and state of what is known."""
+    events = read_events([path], **options)
+    hours = zip(
+        events.bay,
+        (events.start / HOUR_S).round(3),
+        (events.end / HOUR_S).round(3),
+        events.taken,
+        strict=True,
+    )
+    return [(events.bays[bay], float(a), float(b), int(taken)) for bay, a, b, taken in hours], events.faults
+
+
+LAYOUTS = {
+    "stays": (
+        f"bay,arrival,departure\na,{DAY} 08:00,{DAY} 09:00\na,{DAY} 10:00,{DAY} 12:00\n",
+        [("a", 8, 9, 1), ("a", 9, 10, 0), ("a", 10, 12, 1)],
+    ),
+    "both states": (
+        "StreetMarker;ArrivalTime;DepartureTime;VehiclePresent\n"
+        f"a;{DAY} 08:00;{DAY} 09:00;True\na;{DAY} 09:00;{DAY} 11:00;False\n",
+        [("a", 8, 9, 1), ("a", 9, 11, 0)],
+    ),
+    "since": (
+        f"kerbsideid,status,since,updated\na,Present,{DAY} 08:00,{DAY} 09:00\n",
+        [("a", 7.75, 8, 0), ("a", 8, 9, 1)],
+    ),
+    "snapshots side by side": (
+        "bay_id,state_1,since_utc_1,state_2,since_utc_2\n"
+        f"a,occupied,{DAY} 06:00,vacant,{DAY} 08:00\nb,vacant,{DAY} 07:00,,\n",
+        # The first snapshot was at the latest change that it has, 09:00 in Berlin.
+        [("a", 7.75, 8, 0), ("a", 8, 9, 1), ("a", 9.75, 10, 1), ("b", 8.75, 9, 1)],
+    ),
+    "looks": (f"space,time,state\na,{DAY} 08:00,1\na,{DAY} 09:00,0\n", [("a", 8, 8, 1), ("a", 9, 9, 0)]),
+    "moments": (
+        f"bay_id,{DAY}T08:00,{DAY}T09:00,undated\na,1,0,1\nb,,1,0\n",
+        [("a", 8, 8, 1), ("a", 9, 9, 0), ("b", 9, 9, 1)],
+    ),
+    "changes": (
+        "bay,time,state\n" + "".join(f"a,{DAY} {h:02d}:30,{h % 2}\n" for h in range(24)),
+        [("a", h + 0.5, h + 1.5, h % 2) for h in range(23)],
+    ),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_each_layout_is_read(tmp_path, layout):
+    text, wanted = LAYOUTS[layout]
+    path = table(tmp_path, text)
+    assert not is_counts(path)
+    assert spans(path, timezone="Europe/Berlin")[0] == wanted
+
+
+FAULTS = {
+    "negative": f"a,{DAY} 10:00,{DAY} 09:30",
+    "zero": f"a,{DAY} 10:00,{DAY} 10:00",
+    "duplicate": f"a,{DAY} 08:00,{DAY} 09:00",
+    "overlapping": f"a,{DAY} 08:30,{DAY} 08:45",
+    "dead": f"b,{DAY} 08:00,2024-05-10 08:01",
+    "unreadable": "a,yesterday,today",
+    "full_hours": "\n".join(f"b,{DAY} {h:02d}:10,{DAY} {h + 1:02d}:00" for h in range(8)),
+}
+
+
+@pytest.mark.parametrize("rule", FAULTS)
+def test_each_fault_is_cleaned_and_counted(tmp_path, rule):
+    stays = f"bay,arrival,departure\na,{DAY} 08:00,{DAY} 09:00\na,{DAY} 09:00,{DAY} 09:20\n"
+    found, faults = spans(table(tmp_path, stays + FAULTS[rule] + "\n"))
+    assert faults == {rule: 8 if rule == "full_hours" else 1}
+    assert found[0] == ("a", 8, 8.5 if rule == "overlapping" else 9, 1)
+    assert {bay for bay, *_ in found} == {"a"}
+
+
+def test_columns_are_named_and_times_in_utc_want_a_zone(tmp_path):
+    path = table(tmp_path, f"Marker,In,Out\na,{DAY} 06:00,{DAY} 07:00\n")
+    with pytest.raises(
+        InputError, match=r"has the columns 'Marker, In, Out', want bay with .*; see --columns"
+    ):
+        spans(path)
+    assert is_counts(path)
+    columns = "bay=Marker,arrival=In,departure=Out"
+    assert not is_counts(path, columns)
+    assert spans(path, columns=columns)[0] == [("a", 6, 7, 1)]
+    with pytest.raises(InputError, match="has no column 'Bay', but 'Marker, In, Out'"):
+        spans(path, columns="bay=Bay")
+    in_utc = columns.replace("arrival", "arrival_utc").replace("departure", "departure_utc")
+    with pytest.raises(InputError, match="has times in UTC or with an offset, want --timezone"):
+        spans(path, columns=in_utc)
+    assert spans(path, columns=in_utc, timezone="Europe/Berlin")[0] == [("a", 8, 9, 1)]
+
+
+def test_a_stay_over_midnight_is_known_on_both_days(tmp_path):
+    log = OccupancyLog.read(table(tmp_path, f"bay,arrival,departure\na,{DAY} 22:00,2024-05-07 03:00\n"))
+    assert log.days == (DAY, "2024-05-07")
+    assert log.slot_days(np.arange(2)).seen.sum(axis=2).tolist() == [[4.0, 6.0]]
+    assert log.looks.second.tolist() == [
+        *np.arange(22 * HOUR_S, DAY_S, 900.0),
+        *np.arange(0.0, 3 * HOUR_S, 900.0),
+    ]
+
+
+def test_gaps_follow_the_law_given_what_is_known_on_both_sides():
+    """A bridge of a chain with P(taken) 0.3 that forgets 1/e an hour, an hour before and after a taken state."""
+    n = 20_000
+    slot, day = np.repeat(np.arange(n), 2), np.zeros(2 * n, int)
+    log = OccupancyLog(
+        tuple(map(str, range(n))), (DAY,), slot, day, np.tile([7 * HOUR_S, 10 * HOUR_S], n), np.ones(2 * n),
+        known_until=np.tile([8 * HOUR_S, 11 * HOUR_S], n),
+    )  # fmt: skip
+    p, kept = 0.3, np.exp(-1.0)
+    law = np.full((n, 48), np.log(p / (1 - p))), np.full(24, 1 / HOUR_S)
+    states = day_states(log, np.arange(n), *law, np.random.default_rng(0))
+
+    def share(hour):
+        at = [
+            np.searchsorted(states.from_s[a:b], hour * HOUR_S, side="right") - 1
+            for a, b in zip(states.first[:-1], states.first[1:], strict=True)
+        ]
+        return states.occupied[states.first[:-1] + at].mean()
+
+    # States are drawn every five minutes; the last known one before the gap is that of 7:55.
+    since, stays, comes = p + (1 - p) * kept ** (65 / 60), p + (1 - p) * kept, p - p * kept
+    assert share(7.5) == share(10.5) == 1.0
+    assert share(9) == pytest.approx(since * stays / (since * stays + (1 - since) * comes), abs=0.015)
+    assert share(23) == pytest.approx(p, abs=0.015)
+    again = day_states(log, np.arange(n), *law, np.random.default_rng(0))
+    assert np.array_equal(again.from_s, states.from_s)
+
+
+def test_counts_of_kerbs_are_followed_at_their_own_rate(tmp_path):
+    """Readings a minute apart of one kerb and every ten minutes of another: each on its own slots."""
+    rng = np.random.default_rng(1)
+    lines = [f"{DAY} {m // 60:02d}:{m % 60:02d},A,{rng.integers(0, 9)}" for m in range(480, 600)]
+    lines += [f"{DAY} {m // 60:02d}:{m % 60:02d},B,{rng.integers(0, 5)}" for m in range(480, 600, 10)]
+    capacity = table(tmp_path, "kerb,spaces\nA,8\nB,4\n", "capacity.csv")
+    path = table(tmp_path, "time,kerb,cars\n" + "\n".join(lines) + "\n", "counts.csv")
+    counts = Counts.read(path, capacity=capacity)
+    assert is_counts(path)
+    assert not counts.total_faults()["duplicate"]
+    slots = np.array([0] * 8 + [1] * 4 + [-1])
+    log = log_of_counts(counts, slots, tuple(map(str, range(13))), np.zeros(13))
+    assert log.recorded[:, 0].tolist() == [True] * 12 + [False]
+    for line in lines[:118:7] + lines[120:-1]:
+        time, kerb, cars = line.split(",")
+        second = int(time[11:13]) * 3600 + int(time[14:]) * 60
+        known = (log.second <= second) & (second < log.until) & (slots[log.slot] == "AB".index(kerb))
+        assert log.occupied[known].sum() == int(cars)
+        assert known.sum() == (8 if kerb == "A" else 4)
+    readings = [int(line.split(",")[2]) for line in lines[:60]]
+    assert counts.occupied[0, 0, 8] == pytest.approx(np.mean(readings) / 8)
+
+
+def test_counts_in_several_columns_and_without_capacities(tmp_path):
+    path = table(
+        tmp_path,
+        "round,block,green,red\n2024-05-06 08:00,a,2,1\n2024-05-06 09:00,a,,4\n2024-05-06 10:00,a,,\n",
+    )
+    counts = Counts.read(path, capacity="largest", columns="taken=green+red")
+    np.testing.assert_allclose(counts.occupied[0, 0, 8:11], [0.75, 1.0, np.nan])
+
+
+COLUMNS = "bay time state arrival departure since updated state_1 since_1 cars kerb spaces".split()
+VALUES = "| a|1|0|-3|occupied|2024-05-06 08:00|2024-05-06 09:00|0001-01-01 00:00|9999-12-31 23:59|nan".split(
+    "|"
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    header=st.lists(st.sampled_from(COLUMNS), min_size=1, unique=True),
+    rows=st.lists(st.lists(st.sampled_from(VALUES), min_size=12, max_size=12), max_size=8),
+)
+def test_strange_tables_give_a_log_counts_or_a_clear_error(tmp_path_factory, header, rows):
+    path = tmp_path_factory.getbasetemp() / "strange.csv"
+    path.write_text("\n".join(",".join(row[: len(header)]) for row in [header, *rows]) + "\n")
+    with contextlib.suppress(InputError):
+        assert OccupancyLog.read(path, timezone="UTC").looks.days
+    with contextlib.suppress(InputError):
+        assert Counts.read(path, "UTC", "largest").days
