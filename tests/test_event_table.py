@@ -7,12 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError
+from parkenv import InputError, make_scenario
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.event_table import is_counts, read_events
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.counted import log_of_counts
 from parkenv.world.occupancy.gaps import day_states
 from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.occupancy.process import Arrival
 from parkenv.world.week import DAY_S, HOUR_S
 
 DAY = "2024-05-06"
@@ -203,3 +205,30 @@ def test_strange_tables_give_a_log_counts_or_a_clear_error(tmp_path_factory, hea
         assert OccupancyLog.read(path, timezone="UTC").looks.days
     with contextlib.suppress(InputError):
         assert Counts.read(path, "UTC", "largest").days
+
+
+def test_kerbs_of_a_lot_follow_their_own_counts(tmp_path):
+    """Of the slots of `mini`, two are on kerb A, one on B, which no count has; the others follow the forecast."""
+    lines = [
+        f"2024-05-{d:02d} {m // 60:02d}:{m % 60:02d},A,{m % 3}" for d in (6, 7, 8) for m in range(420, 900, 5)
+    ]
+    counts = table(tmp_path, "time,kerb,cars\n" + "\n".join(lines) + "\n", "counts.csv")
+    ids = make_scenario("mini").lot.slot_ids
+    mapping = table(tmp_path, f"slot_id,log_slot_id\n{ids[0]},A\n{ids[1]},A\n{ids[2]},B\n", "mapping.csv")
+    occupancy = {"counts": {"file": str(counts), "capacity": "largest"}, "mapping": str(mapping)}
+    with pytest.warns(UserWarning, match=f"{len(ids) - 2} of {len(ids)} slots of the lot have no record"):
+        scenario = make_scenario({"lot": "mini", "occupancy": occupancy})
+    arrival = Arrival(1 * DAY_S + 8 * HOUR_S, "2024-05-07")
+    world, forecast = scenario.occupancy.world(0, arrival), scenario.forecast(arrival).p_occupied
+    for minute in range(0, 300, 5):
+        taken = world.occupied([0, 1], arrival.time + 60.0 * minute)
+        assert taken.sum() == (480 + minute) % 3
+    assert forecast[2:] == pytest.approx(forecast[:2].mean())
+    occupancy["counts"]["columns"] = "time_utc=time"
+    with pytest.raises(InputError, match=r"counts\.csv: has times in UTC or with an offset, want --timezone"):
+        make_scenario({"lot": "mini", "occupancy": occupancy})
+    late = {"counts": {"file": str(counts), "capacity": "largest"}, "replay_from": "2024-05-09"}
+    with pytest.raises(
+        InputError, match=r"no recorded day from 2024-05-09 on .* its 3 days are from 2024-05-06 to"
+    ):
+        make_scenario({"lot": "mini", "occupancy": late}).occupancy.days_in(ArrivalWindow())

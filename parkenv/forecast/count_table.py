@@ -180,6 +180,8 @@ def read_table(
         moment = row[when[0]] if len(when) == 1 else " ".join(row[i].strip() for i in when)
         try:
             time = clock(moment, utc, before)
+        except InputError:
+            raise
         except (ValueError, OverflowError):
             wanted = "a time such as 2024-03-01T07:00 or 01.03.2024 07:00"
             raise InputError(

@@ -269,8 +269,9 @@ class RecordedOccupancy(OccupancyModel):
         ]
         if not days:
             names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
+            there = f"its {len(n)} days are from {self.log.days[0]} to {self.log.days[-1]}"
             since = "" if self.replay_from is None else f" from {self.replay_from} on"
-            raise InputError(f"{self.log.source}: no recorded day{since} is one of {names}")
+            raise InputError(f"{self.log.source}: no recorded day{since} is one of {names}; {there}")
         return days
 
     def world(self, key: np.uint64, arrival: Arrival) -> RecordedWorld:  # noqa: ARG002 - the day decides all
