@@ -16,7 +16,7 @@ from parkenv.studies.results import SPEC_FILE
 from parkenv.studies.runner import run
 
 OURS = ("belief(budget_ms=1)", "mdp", "network", "rollout")
-PEERS = ("examples.pomdp_py_agents:POUCT", "examples.pomdp_py_agents:POMCP")
+PEERS = ("examples.peers.pomdp_py_agents:POUCT", "examples.peers.pomdp_py_agents:POMCP")
 """Planners of pomdp-py, by the adapters among the examples."""
 SCENARIOS = ("mini", "campus", "street", "jam")
 REAL_PLACES = ("place-01", "place-09", "place-17")

@@ -115,7 +115,7 @@ FEWER = {
 }
 """What is done often on a page or in an example, and how it is done less often here: the same code runs."""
 
-NEEDS = {"examples/pomdp_py_agents.py": "pomdp_py", "examples/shorten_drives.py": "casadi"}
+NEEDS = {"examples/shorten_drives.py": "casadi"}
 """Libraries of others, in no extra that the tests need, without which an example cannot run."""
 
 
@@ -213,6 +213,6 @@ def test_pages_are_short():
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
 def test_an_example_says_how_long_it_takes(path):
     """Those that are no scripts, or take as long as they are told, say nothing."""
-    if path.stem not in ("ground_detector", "pomdp_py_agents", "shorten_drives"):
+    if path.stem not in ("ground_detector", "shorten_drives"):
         said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
         assert re.search(r"\b(seconds|minutes?)\b", said), f"{path}: says not how long it takes"

@@ -10,7 +10,7 @@ import parkenv
 from parkenv import InputError
 from planners import make_agent
 
-PEERS = ("examples.pomdp_py_agents:POUCT", "examples.pomdp_py_agents:POMCP")
+PEERS = ("examples.peers.pomdp_py_agents:POUCT", "examples.peers.pomdp_py_agents:POMCP")
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 Any command takes them from here (`pip install "parkenv[pomdp]"`):
 
-    parkenv compare --scenario mini --agents "belief,examples.pomdp_py_agents:POUCT(budget_ms=100)"
+    parkenv compare --scenario mini --agents "belief,examples.peers.pomdp_py_agents:POUCT(budget_ms=100)"
 
 `POUCT` keeps the belief of parkenv, `POMCP` particles of its own. From a leaf of the tree a heuristic drives on to the
 end of the search, in compiled code: a single action of pomdp-py's rollout.
