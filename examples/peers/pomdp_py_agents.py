@@ -209,7 +209,12 @@ class POUCT(ModelAgent):
             memory.agent = pomdp_py.Agent(
                 self.first_belief(memory), self.allowed, blackbox_model=self.driving
             )
-        number = memory.planner.plan(memory.agent).number
+        try:
+            number = memory.planner.plan(memory.agent).number
+        except AttributeError:
+            if memory.agent.tree is not None:
+                raise
+            number = DRIVE_ON  # there was no time for a single simulation
         if number == DRIVE_ON or number not in actions:
             number = self.model.sample(memory.belief, memory.rng).choose(self.driving.base)[0]
         return int(number)
@@ -220,7 +225,7 @@ class POUCT(ModelAgent):
 
     def goes_on(self, memory: TreeSearch) -> bool:
         """Cut the tree to what is below the last action and what was seen then; return whether anything is left."""
-        if memory.agent is None or memory.action is None:
+        if memory.agent is None or memory.agent.tree is None or memory.action is None:
             return False
         act = ACTS[memory.action]
         memory.agent.update_history(act, memory.seen)
