@@ -209,7 +209,7 @@ def write(network, file):
     """Write the network as ONNX, and how it is fed beside it."""
     torch.onnx.export(Cells(network), (torch.zeros(1, 1, 480, 640),), file, dynamo=False, opset_version=13)
     settings = f'size = [640, 480]\nchannels = "grey"\nmean = {GREY_MEAN}\nstd = {GREY_STD}\n'
-    file.with_suffix(".toml").write_text(settings + "enlarge = 2.0\nfollow = true\nhalved_from = 40\n")
+    file.with_suffix(".toml").write_text(settings + "enlarge = 2.0\nfollow = true\nnear_from = 40\n")
 
 
 if __name__ == "__main__":

@@ -159,7 +159,7 @@ def test_small_pictures_are_enlarged_no_more_than_told(street):
 
 def test_the_input_follows_a_pictures_proportions(net, street, monkeypatch):
     image, truth = street
-    detector, seen = with_settings(net.settings.changed(follow=True, mirror=False, halved_from=None)), []
+    detector, seen = with_settings(net.settings.changed(follow=True, mirror=False, near_from=None)), []
     run = detector._run
     monkeypatch.setattr(detector, "_run", lambda fed: seen.append(fed.shape[:1:-1]) or run(fed))
     wide = np.ascontiguousarray(image[150:342])  # 640×192
@@ -173,13 +173,13 @@ def test_the_input_follows_a_pictures_proportions(net, street, monkeypatch):
     assert seen[-1] == (640, 480)
 
 
-def test_cars_that_fill_the_picture_are_looked_for_at_half_the_size(net, monkeypatch):
+def test_cars_that_fill_the_picture_are_looked_for_at_a_smaller_size(net, monkeypatch):
     image, truth = drawn([[0.4, 2.9, 0.0], [30.0, 40.0, 0.0], [-30.0, 40.0, 0.0]])
-    once, twice = (with_settings(net.settings.changed(halved_from=n)) for n in (None, 40))
+    once, twice = (with_settings(net.settings.changed(near_from=n)) for n in (None, 40))
     seen, run = [], twice._run
     monkeypatch.setattr(twice, "_run", lambda fed: seen.append(fed.shape[:1:-1]) or run(fed))
     found, before = twice.detect(image), once.detect(image)
-    assert seen == [(640, 480), (320, 256)]
+    assert seen == [(640, 480), (384, 288)]
     near = truth.visible_box[0]
     assert max(overlap(box, near) for box in found.select(found.probability > 0.5).boxes) > 0.8
     small = before.boxes[:, 3] - before.boxes[:, 1] < 40
@@ -189,7 +189,7 @@ def test_cars_that_fill_the_picture_are_looked_for_at_half_the_size(net, monkeyp
 
 def test_small_pictures_are_looked_at_mirrored_too(net, street):
     small = np.ascontiguousarray(cv2.resize(street[0], (200, 150), interpolation=cv2.INTER_AREA)[:140])
-    net = with_settings(net.settings.changed(halved_from=None))
+    net = with_settings(net.settings.changed(near_from=None))
     found, other = net.detect(small), net.detect(np.ascontiguousarray(small[:, ::-1]))
     turned = other.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (200, 0, 200, 0)
     sure = np.flatnonzero(found.probability > 0.3)

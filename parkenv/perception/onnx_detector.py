@@ -50,6 +50,7 @@ net.forward(list(net.getUnconnectedOutLayersNames()))
 """
 _passed: dict[tuple[str, tuple[int, ...]], tuple[int, int]] = {}
 _COCO = {1: (0,), 80: (2, 5, 7)}  # cars by the number of classes: the only one, or COCO's car, bus and truck
+_NEAR_LOOK = 0.6  # size of a second look at what is near
 _BORDER = 114  # grey level around an image in the input
 _CENTER_NUMBERS = 9
 # px, of an input that follows the image: a side is a multiple of the one, at most the other
@@ -114,11 +115,11 @@ class OnnxSettings(Spec):
         description="Whether the input has each image's proportions instead, at the number of pixels of size and in "
         "multiples of 32 px; for the layout centers only.",
     )
-    halved_from: int | None = Field(
+    near_from: int | None = Field(
         None,
         ge=1,
         le=4096,
-        description="Image and input are also looked at at half the size, for boxes that are at least as many px high "
+        description="Image and input are also looked at at 0.6 of the size, for boxes that are at least as many px high "
         "there: cars so near that they fill the picture. For the layout centers only; by default they are not.",
     )
     mirror: bool = Field(
@@ -234,8 +235,8 @@ class OnnxDetector:
 
     def detect(self, image: Image) -> Detections:
         decoded = self._look(image)
-        if self._is_centers and self.settings.halved_from:
-            decoded = decoded.joined(self._look(image, 0.5))
+        if self._is_centers and self.settings.near_from:
+            decoded = decoded.joined(self._look(image, _NEAR_LOOK))
         size = decoded.boxes[:, 2:] - decoded.boxes[:, :2]
         decoded = decoded.select(np.isfinite(decoded.boxes).all(axis=1) & (size > 0.0).all(axis=1))
         decoded = decoded.select(best_boxes(decoded.boxes, decoded.score, self.settings.overlap))
@@ -266,7 +267,7 @@ class OnnxDetector:
             raise InputError(
                 f"{self._name}: has scores from {found.score.min():.4g} to {found.score.max():.4g}, want 0 to 1"
             )
-        least = 0 if size == 1.0 else self.settings.halved_from or 0
+        least = 0 if size == 1.0 else self.settings.near_from or 0
         height = found.boxes[:, 3] - found.boxes[:, 1]
         found = found.select((found.score >= self.settings.threshold) & (height >= least))
         boxes = (found.boxes.astype(np.float64) - np.tile(offset, 2)) / np.tile(scale, 2)

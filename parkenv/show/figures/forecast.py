@@ -15,7 +15,8 @@ from matplotlib.axes import Axes
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.forecast.comparison import Compared
-from parkenv.forecast.counts import HOURS, Counts
+from parkenv.forecast.count_table import HOURS
+from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_forecast import draw_days
 from parkenv.forecast.scores import Band, mean_where
 from parkenv.forecast.slot_comparison import ComparedSlots

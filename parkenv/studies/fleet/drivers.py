@@ -18,8 +18,9 @@ from parkenv.engine.network import compiled_network
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.known_names import SAME_SLOTS
 from parkenv.scenarios.build import build
-from parkenv.scenarios.spec import SAME_SLOTS, ScenarioSpec
+from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.setting import COUNTED, GIVEN, times_demanded
 from parkenv.studies.study import Progress
