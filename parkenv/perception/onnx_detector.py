@@ -119,8 +119,8 @@ class OnnxSettings(Spec):
         None,
         ge=1,
         le=4096,
-        description="Image and input are also looked at at 0.6 of the size, for boxes that are at least as many px high "
-        "there: cars so near that they fill the picture. For the layout centers only; by default they are not.",
+        description="Image and input are looked at again at 0.6 of the size, for boxes that are at least as many px "
+        "high there: cars so near that they fill the picture. For the layout centers only; by default they are not.",
     )
     mirror: bool = Field(
         False,
