@@ -129,7 +129,7 @@ def test_a_stay_over_midnight_is_known_on_both_days(tmp_path):
 
 def test_gaps_follow_the_law_given_what_is_known_on_both_sides():
     """A bridge of a chain with P(taken) 0.3 that forgets 1/e an hour, an hour before and after a taken state."""
-    n = 20_000
+    n = 3_000
     slot, day = np.repeat(np.arange(n), 2), np.zeros(2 * n, int)
     log = OccupancyLog(
         tuple(map(str, range(n))), (DAY,), slot, day, np.tile([7 * HOUR_S, 10 * HOUR_S], n), np.ones(2 * n),
@@ -149,8 +149,8 @@ def test_gaps_follow_the_law_given_what_is_known_on_both_sides():
     # States are drawn every five minutes; the last known one before the gap is that of 7:55.
     since, stays, comes = p + (1 - p) * kept ** (65 / 60), p + (1 - p) * kept, p - p * kept
     assert share(7.5) == share(10.5) == 1.0
-    assert share(9) == pytest.approx(since * stays / (since * stays + (1 - since) * comes), abs=0.015)
-    assert share(23) == pytest.approx(p, abs=0.015)
+    assert share(9) == pytest.approx(since * stays / (since * stays + (1 - since) * comes), abs=0.035)
+    assert share(23) == pytest.approx(p, abs=0.035)
     again = day_states(log, np.arange(n), *law, np.random.default_rng(0))
     assert np.array_equal(again.from_s, states.from_s)
 
@@ -193,7 +193,7 @@ VALUES = "| a|1|0|-3|occupied|2024-05-06 08:00|2024-05-06 09:00|0001-01-01 00:00
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     header=st.lists(st.sampled_from(COLUMNS), min_size=1, unique=True),
     rows=st.lists(st.lists(st.sampled_from(VALUES), min_size=12, max_size=12), max_size=8),
