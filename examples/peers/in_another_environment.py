@@ -19,6 +19,7 @@ import subprocess
 import tempfile
 import threading
 import weakref
+from contextlib import suppress
 from itertools import count, pairwise
 from pathlib import Path
 from typing import IO, Any, ClassVar
@@ -109,7 +110,7 @@ class _Process:
             raise InputError(f"command {self.name!r:.60} cannot be run: {error.strerror}") from None
         self.process, self.lines = process, queue.SimpleQueue[str]()
         threading.Thread(target=_read, args=(process.stdout, self.lines), daemon=True).start()
-        weakref.finalize(self, _end, process)
+        weakref.finalize(self, _end, process, self.errors)
 
     def ask(self, message: dict[str, Any], timeout_s: float) -> dict[str, Any]:
         """Send a message, and return the answer."""
@@ -146,9 +147,12 @@ def _read(stream: IO[str], lines: queue.SimpleQueue[str]) -> None:
     lines.put("")
 
 
-def _end(process: subprocess.Popen[str]) -> None:
+def _end(process: subprocess.Popen[str], errors: IO[bytes]) -> None:
     process.kill()
     process.wait()
+    errors.close()
+    with suppress(OSError):  # what it has not read
+        process.stdin.close()
 
 
 def described(problem: SearchProblem) -> dict[str, Any]:
