@@ -30,7 +30,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from examples.peers.to_a_slot import SlotAgent
+from examples.peers.to_a_slot import SURELY_TAKEN, SlotAgent
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import require_whole
 from parkenv.world.scenario import SearchProblem
@@ -87,8 +87,8 @@ class ReplannedMDP(SlotAgent[Route]):
         index_s = drive_s / np.maximum(p_free, _LEAST) + cost_s
         leave_rate = np.float64(belief.decay_rate) * (1.0 - belief.forecast)
         wait_s = np.minimum(1.0 / np.maximum(leave_rate, _LEAST), self.problem.give_up_s) + cost_s
-        # Where the car stands before a taken bay, it tries another one.
-        index_s[p_free < _LEAST] = np.inf
+        # Where the car stands before a bay that it takes for taken, it tries another one.
+        index_s[p_free <= 1.0 - SURELY_TAKEN] = np.inf
         bays = np.argpartition(index_s, self.n_bays - 1)[: self.n_bays]
         bays = bays[np.isfinite(index_s[bays])]
         if not len(bays):
