@@ -49,6 +49,7 @@ _LOT_COLUMNS = (
     Column("reason", "reason"),
 )
 _LEFT_OUT = (Column("reason", "reason"), Column("bays", "bays", digits=0), Column("ids", "ids"))
+_MOST_ZONES = 12  # most zones of a lot that are printed
 _MOST_UNREAD = 20  # most rows of what could not be read that are printed
 AUTO = "auto"  # value of `--entry` and `--goal` that allows a guess
 LotName = Annotated[
@@ -492,7 +493,9 @@ def _summary(lot: ParkingLot) -> str:
         word, counts = "spaces" if n_counted else "slots", Counter[int]()
         for zone, capacity in zip(lot.zone_of_slot.tolist(), lot.capacity.tolist(), strict=True):
             counts[zone] += capacity
-        parts.append(f"zones {', '.join(f'{zone} ({counts[i]} {word})' for i, zone in enumerate(lot.zones))}")
+        shown = sorted(zone for zone, _ in counts.most_common(_MOST_ZONES))
+        parts.append(f"zones {', '.join(f'{lot.zones[zone]} ({counts[zone]} {word})' for zone in shown)}")
+        parts += [f"{len(counts) - len(shown)} smaller zones"] if len(counts) > len(shown) else []
     cost = lot.slot_parking_cost_s
     if cost.any():
         parts.append(

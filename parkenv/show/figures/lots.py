@@ -147,7 +147,7 @@ def _ground(figure: Figure, box: Any, low: FloatArray, high: FloatArray, fontsiz
 @mpl.rc_context(STYLE)
 def save_town_picture(town: TownDraft, path: str | Path) -> None:
     draft = town.draft
-    points = np.concatenate([lane.points for lane in draft.lanes])
+    points = np.concatenate([draft.slots.xy, *(lane.points for lane in draft.lanes)])
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(high - low, 50.0) * 1.06
     inch = 14.0 / max(size[0], 1.4 * size[1])
