@@ -217,8 +217,6 @@ def lot_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "wanted"),
     [
-        ("datetime,camera,slot_id,weather,occupied,mood\n2015-11-12 07:09,1,a,sunny,0,glad\n", "mood"),
-        (LOG + "2015-11-12 09:09,1,a,sunny,0\n2015-11-12 08:09,1,a,sunny,1\n", "line 3"),
         (LOG + "2015-11-12 09:09,1,a,sunny,2\n", "line 2"),
         (LOG, "log.csv"),
         (ONE_DAY, "at least one more to forecast from"),

@@ -159,7 +159,7 @@ DAY = "2024-01-29"
     ("options", "message"),
     [
         (["--car-park", "P9", "--replay-from", DAY], "'P9'"),
-        (["--car-park", "P0", "--replay-from", "2024-01-03"], "2024-01-08"),
+        (["--car-park", "P0", "--replay-from", "2024-01-02"], "2024-01-03"),
         ([], "has 3 car parks, want --car-park, one of P0, P1, empty"),
         (["--car-park", "P0", "--capacity", 90], "has a column 'capacity', want no --capacity"),
         (["--car-park", "P0", "--replay-from", DAY, "--forecast-from", "others"], "rolling or past"),

@@ -174,7 +174,7 @@ def test_the_input_follows_a_pictures_proportions(net, street, monkeypatch):
 
 
 def test_cars_that_fill_the_picture_are_looked_for_at_a_smaller_size(net, monkeypatch):
-    image, truth = drawn([[0.4, 2.9, 0.0], [30.0, 40.0, 0.0], [-30.0, 40.0, 0.0]])
+    image, truth = drawn([[0.4, 3.6, 0.0], [30.0, 40.0, 0.0], [-30.0, 40.0, 0.0]])
     once, twice = (with_settings(net.settings.changed(near_from=n)) for n in (None, 40))
     seen, run = [], twice._run
     monkeypatch.setattr(twice, "_run", lambda fed: seen.append(fed.shape[:1:-1]) or run(fed))

@@ -105,7 +105,7 @@ def test_what_is_no_scenario_is_refused_in_a_line(folder, tmp_path_factory):
         with pytest.raises(InputError, match=message) as caught:
             make_scenarios(source)
         assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="holds 5 scenarios, want one"):
+    with pytest.raises(InputError, match="holds 6 scenarios, want one"):
         scenario_spec("parkenv/lots/packaged")
     with pytest.raises(InputError, match="scenario has 6 scenarios, want one"):
         gym.make("parkenv/SearchSensors-v2", scenario=PLACES)

@@ -59,7 +59,7 @@ def mean_over_days(values: ArrayLike, days: ArrayLike) -> tuple[float, float, fl
     Examples:
         >>> mean, low, high = mean_over_days([1.0, 1.0, 1.0, 3.0], ["mon", "mon", "mon", "tue"])
         >>> round(mean, 2), round(high - mean, 2)
-        (1.5, 6.74)
+        (1.5, 9.53)
     """
     sample, (names, day) = np.asarray(values, np.float64), np.unique(np.asarray(days), return_inverse=True)
     if len(names) < 2:
