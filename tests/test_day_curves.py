@@ -194,7 +194,7 @@ def test_reliability_and_bands_of_a_known_forecast():
 def test_forecasts_of_german_car_parks():
     if not GERMAN.exists():
         pytest.skip("the German car parks are not in shared/data")
-    counts = Counts.read(GERMAN)
+    counts = Counts.read(GERMAN, timezone="Europe/Berlin")
     year, first = counts.day_index(date(2024, 1, 1)), 150
     counts = counts.part(range(0, len(counts.car_parks), 6), year - first, year + 150)
     compared = list(compare(counts, first, fit_settings(counts, first)))

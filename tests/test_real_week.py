@@ -83,7 +83,7 @@ def test_the_fit_finds_the_week_the_levels_and_the_days():
 @pytest.mark.slow
 @pytest.mark.skipif(not GERMAN.exists(), reason="the counts of German car parks are not here")
 def test_the_table_is_that_of_the_counts():
-    fitted = fit_typical_week(Counts.read(GERMAN))
+    fitted = fit_typical_week(Counts.read(GERMAN, timezone="Europe/Berlin"))
     assert fitted is not None
     np.testing.assert_allclose(100.0 * fitted.occupied.ravel(), OCCUPIED, atol=0.51)
     np.testing.assert_allclose(fitted.levels, LEVELS, atol=0.006)
