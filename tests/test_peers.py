@@ -1,6 +1,7 @@
 """Methods of others as agents of ours, and comparisons of planners at several times for a decision."""
 
 import gc
+import random
 import sys
 from importlib import import_module
 from itertools import permutations
@@ -41,12 +42,23 @@ def totals(env, agent, n=8):
 def test_planners_of_pomdp_py_gain_on_the_heuristic_of_their_rollouts(peers):
     scenario = parkenv.make_scenario("mini", day_error=0.8)
     env = gym.make("parkenv/Search-v2", scenario=scenario)
-    least = totals(env, make_agent("greedy-total", scenario))
+    for base, simulations, share in (("random", 60, 0.5), ("greedy-total", 200, 1.0)):
+        most = share * totals(env, make_agent(base, scenario))
+        for name in peers:
+            assert totals(env, make_agent(name, scenario, simulations=simulations, base=base)) < most
+
+
+def test_planners_of_pomdp_py_are_seeded_and_leave_the_generator_of_python_alone(peers):
+    scenario = parkenv.make_scenario("mini", day_error=0.8)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     for name in peers:
-        found = [totals(env, make_agent(name, scenario, simulations=60)) for _ in range(2)]
-        assert found[0] < least + 0.5
-        if name == PEERS[0]:  # POMCP draws with Python's own generator
-            assert found[0] == found[1]
+        found = []
+        for seed in (1, 2):
+            random.seed(seed)
+            state = random.getstate()
+            found.append(totals(env, make_agent(name, scenario, simulations=60)))
+            assert random.getstate() == state
+        assert found[0] == found[1]
 
 
 def test_no_key_of_the_world_can_be_reached_from_their_memory(peers):

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import random
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -147,6 +149,17 @@ class Allowed(pomdp_py.RolloutPolicy):
         return ACTS[DRIVE_ON]
 
 
+@contextlib.contextmanager
+def seeded(rng: np.random.Generator) -> Iterator[None]:
+    """Make Python's own generator, with which pomdp-py draws particles, depend on `rng`; then restore its state."""
+    state = random.getstate()
+    random.seed(int(rng.integers(2**63)))
+    try:
+        yield
+    finally:
+        random.setstate(state)
+
+
 @dataclass
 class TreeSearch(ModelSearch):
     """Memory of an episode: that of every planner on the model, pomdp-py's planner, and what it has just seen."""
@@ -197,7 +210,8 @@ class POUCT(ModelAgent):
     def decide(self, observation: Any, belief: SlotBelief, memory: TreeSearch) -> int:
         """See `ModelAgent`."""
         memory.seen = Seen(Observation.of(observation))
-        return super().decide(observation, belief, memory)
+        with seeded(memory.rng):
+            return super().decide(observation, belief, memory)
 
     def choose(self, actions: np.ndarray, memory: TreeSearch) -> int:
         """Go on with the part of the tree below what was seen, and plan."""
