@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logit
 
 from parkenv.belief import day_belief
-from parkenv.belief.day_belief import EVENT, DayBelief
+from parkenv.belief.day_belief import EVENT, DayBelief, independent_share
 from parkenv.belief.day_belief import UNINFORMATIVE_SLOT_PROBABILITY as DOUBT
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.occupancy.centred_logits import centred_logits
@@ -85,6 +85,28 @@ def test_filling_a_nearly_empty_lot_takes_more_than_two_taken_slots(taken_in_a_r
     day.update(belief.observations)
     found = day.p_occupied(belief.time)[rest]
     assert found.min() > 0.99 if believed else found.max() < 0.25
+
+
+def test_a_full_kerb_is_no_full_district():
+    """Twelve taken slots say less of the others if they are of one kerb, and as much if each is of its own."""
+    near = nearness(np.arange(60.0))
+    before = SlotBelief.of_forecast(np.full(60, 0.7), np.zeros(60), (0.5, 0.0))
+    belief = before.update(np.arange(12), np.full(12, True))
+    kerbs = {
+        "one": np.repeat(np.arange(5), 12),
+        "own": np.arange(60),
+        "none": np.full(60, -1),
+    }
+    elsewhere = {}
+    for name, facility in kerbs.items():
+        day = DayBelief(before, near, evidence=independent_share(facility))
+        day.update(belief.observations)
+        elsewhere[name] = day.p_occupied(belief.time)[12:].mean()
+        assert day.p_occupied(belief.time)[:12].min() == 1.0
+    day = DayBelief(before, near)
+    day.update(belief.observations)
+    assert elsewhere["own"] == elsewhere["none"] == day.p_occupied(belief.time)[12:].mean()
+    assert 0.7 < elsewhere["one"] < 0.7 + 0.6 * (elsewhere["own"] - 0.7)
 
 
 def test_sensor_errors_and_repeated_observations_count_for_what_they_say():

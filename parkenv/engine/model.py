@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from parkenv.belief.day_belief import UNINFORMATIVE_SLOT_PROBABILITY, DayBelief
+from parkenv.belief.day_belief import UNINFORMATIVE_SLOT_PROBABILITY, DayBelief, independent_share
 from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of, call_at
@@ -233,7 +233,8 @@ class Model:
         error = DayError(*(float(deviation) for deviation in seen.day_error))
         near, days = nearness(self.problem.walk_s), _Days.of(error)
         if self._any_day:
-            day = DayBelief(slots, near, doubt=UNINFORMATIVE_SLOT_PROBABILITY)
+            share = independent_share(self.problem.lot.facility_of_slot)
+            day = DayBelief(slots, near, doubt=UNINFORMATIVE_SLOT_PROBABILITY, evidence=share)
         else:
             centre = centred_logits(forecast, error.deviations(near))
             logits = centre[:, None] + days.level + near[:, None] * days.slope

@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.day_belief import EVENT, UNINFORMATIVE_SLOT_PROBABILITY, DayBelief
+from parkenv.belief.day_belief import EVENT, UNINFORMATIVE_SLOT_PROBABILITY, DayBelief, independent_share
 from parkenv.belief.slot_belief import UNOBSERVED, Observations, SlotBelief
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import require_number
@@ -163,6 +163,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         self._doubt, self._event = doubt, event
         self._day = day
         self._nearness = nearness(self.problem.walk_s)
+        self._evidence = independent_share(self.problem.lot.facility_of_slot)
         self._worth_passing_s = WORTH_PASSING_S if day else 0.0
         self._budget = Budget(np.array(FAILURE_COSTS), int(budget_ms * WORK_PER_MS), DEPTH)
         # s, what a taken slot costs on arrival; with a perfect sensor none is attempted
@@ -210,6 +211,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             rival_rates=None if rival_rates is None else rival_rates[slots],
             doubt=self._doubt,
             event=self._event,
+            evidence=self._evidence[slots],
         )
 
     def _rival_rates(self, belief: SlotBelief, crowd: Crowd) -> FloatArray | None:
@@ -333,10 +335,9 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 
 
 def snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapshot:
-    weights, p_free_if = memory.day.mixture()
     slots = np.empty(len(memory.state), SLOT)
     slots["missed_rate"], slots["state"] = memory.missed_rate, memory.state
-    belief = BeliefSnapshot(slots, weights, p_free_if)
+    belief = BeliefSnapshot(slots, *memory.day.mixture())
     drive_s = memory.near.table.seconds[here]
     set_slots(belief, known.parts, memory.day.p_occupied(known.time), drive_s)
     return belief

@@ -220,7 +220,7 @@ def _observe_here(search: Search, path: PathBuffer) -> None:
                 continue
         is_first = belief.slots[s].state == UNOBSERVED and path.marks[s].observed_at < 0.0
         if is_first:
-            p_free = p_free_when_first_observed(weights, belief.p_free_if[s], True)
+            p_free = p_free_when_first_observed(s, weights, belief, True)
             n_first += 1
         else:
             p_free = p_free_again(s, time, path.marks[s].observed_at, belief)
@@ -368,13 +368,16 @@ def p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnaps
 
 
 @leaf
-def p_free_when_first_observed(weights: FloatArray, p_free_if: FloatArray, taken_follows: bool) -> float:
+def p_free_when_first_observed(
+    slot: int, weights: FloatArray, belief: BeliefSnapshot, taken_follows: bool
+) -> float:
     """Return the mean P(free) of a slot; the weights, (k,), change in place if the path goes on only if it is taken."""
-    p_free: float = mean_over_days(weights, p_free_if)
+    p_free: float = mean_over_days(weights, belief.p_free_if[slot])
     if taken_follows:
-        scale = 1.0 / (1.0 - p_free)
+        taken_if = belief.taken_if[slot]
+        scale = 1.0 / mean_over_days(weights, taken_if)
         for h in range(len(weights)):
-            weights[h] *= (1.0 - p_free_if[h]) * scale
+            weights[h] *= taken_if[h] * scale
     return p_free
 
 
@@ -520,7 +523,7 @@ def _learn_on_the_way(belief: BeliefSnapshot, path: PathBuffer) -> None:
         observation = path.observations[j]
         if observation.is_first:
             observation.p_free = p_free_when_first_observed(
-                weights, belief.p_free_if[observation.slot], observation.parks
+                observation.slot, weights, belief, observation.parks
             )
 
 

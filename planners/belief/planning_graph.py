@@ -144,6 +144,9 @@ class BeliefSnapshot(NamedTuple):
     slots: Records  # (n_slots,) `SLOT` records
     weights: FloatArray  # (k,) float64, probabilities of the hypotheses of the forecast error model
     p_free_if: FloatArray  # (n_slots, k) float64, P(free) of an unobserved slot under each of them
+    # (n_slots, k) float64, likelihood of each of them if the slot is observed taken: 1 - P(free), or nearer to 1 at a
+    # kerb, whose slots fill together
+    taken_if: FloatArray
 
 
 @leaf

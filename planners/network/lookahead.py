@@ -174,9 +174,12 @@ def _observe_here(
                 p_free += weights[h] * p_free_if[h]
             # Where the car would park, going on means that the slot was taken.
             if cost_s <= value:
-                rest = 1.0 / max(1.0 - p_free, 1e-9)
+                taken_if, p_taken = belief.taken_if[s], 0.0
                 for h in range(len(weights)):
-                    weights[h] *= (1.0 - p_free_if[h]) * rest
+                    p_taken += weights[h] * taken_if[h]
+                rest = 1.0 / max(p_taken, 1e-9)
+                for h in range(len(weights)):
+                    weights[h] *= taken_if[h] * rest
         else:
             p_free = p_free_again(s, seconds, scratch.seen_at[s], belief)
             if p_free == 0.0:
