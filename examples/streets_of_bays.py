@@ -199,13 +199,13 @@ def main():
         "register", type=Path, nargs="?", default=Path("bays.csv"), help="default: a made one"
     )
     parser.add_argument("--out", type=Path, default=Path("streets.osm"))
-    parser.add_argument("--columns", default="", help="as of `parkenv lot import --bays`")
+    parser.add_argument("--columns", help="as of `parkenv lot import --bays`")
     given = parser.parse_args()
     if not given.register.exists():
         made = [(48.0, 7.85 + 1e-4 * k) for k in range(9)] + [(48.0002 + 7e-5 * k, 7.8512) for k in range(9)]
         lines = (f"{k},{lat:.6f},{lon:.6f}" for k, (lat, lon) in enumerate(made))
         given.register.write_text("\n".join(["bay_id,lat,lon", *lines]))
-    register = read_bays(given.register, dict(pair.split("=") for pair in given.columns.split(",") if pair))
+    register = read_bays(given.register, given.columns)
     frame = LocalFrame.around(shapely.get_coordinates(shapely.centroid(register.shapes)))
     rows, depth, names = rows_of(register, frame)
     pieces = centre_lines(rows, depth, names)

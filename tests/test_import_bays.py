@@ -157,7 +157,7 @@ def test_kerb_lines_hold_the_most_cars_counted(tmp_path):
     rows = [f"K,{line},{a},{b}" for a, b in ((1, ""), (5, 2), (3, 3))] + ["Z,,1,1"]
     bays = tmp_path / "counts.csv"
     bays.write_text("\n".join(["block,line,green,red", *rows]))
-    town = imported(tmp_path, bays, columns={"cars": "green+red"})
+    town = imported(tmp_path, bays, columns="cars=green+red")
     assert set(town.draft.slot_ids) == {f"K-{k}" for k in range(1, 8)}
     assert left_out(town) == {"bays without a position": {"Z"}}
     assert "capacity of kerb lines, which is not given: the most cars in any row" in town.draft.found
@@ -223,9 +223,9 @@ def test_registers_that_cannot_be_read_say_what_was_wanted(tmp_path):
     bays = tmp_path / "bays.csv"
     bays.write_text("Ref,Northing,Easting\n1,48.0,7.85\n")
     assert "no position in its columns Ref, Northing, Easting; want --columns" in refusal(read_bays, bays)
-    assert "'Nording'" in refusal(read_bays, bays, {"lat": "Nording"})
-    assert "'latitude'" in refusal(read_bays, bays, {"latitude": "Northing"})
-    assert len(read_bays(bays, {"bay": "Ref", "lat": "Northing", "lon": "Easting"}).ids) == 1
+    assert "'Nording'" in refusal(read_bays, bays, "lat=Nording")
+    assert "'latitude'" in refusal(read_bays, bays, "latitude=Northing")
+    assert len(read_bays(bays, "bay=Ref,lat=Northing,lon=Easting").ids) == 1
     bays.write_text("bay_id,lat,lon\n1,,\n")
     assert "no bay in it (bays without a position: 1)" in refusal(read_bays, bays)
     far = meters(tmp_path / "far.csv", [(9_000.0, 9_000.0)])
@@ -267,8 +267,7 @@ def streets_of(register, out, columns, monkeypatch):
         sys, "argv", ["streets_of_bays.py", str(register), "--out", str(out), "--columns", columns]
     )
     streets_of_bays.main()
-    pairs = dict(pair.split("=") for pair in columns.split(",") if pair)
-    return import_town(out, bays=register, columns=pairs, bays_only=True)
+    return import_town(out, bays=register, columns=columns, bays_only=True)
 
 
 def test_streets_are_drawn_between_bays_where_no_map_is_at_hand(tmp_path, monkeypatch):

@@ -150,12 +150,6 @@ def _point(text: str) -> str:
     return text
 
 
-def _pairs(text: str) -> dict[str, str]:
-    pairs = [pair.partition("=") for pair in text.split(",")]
-    require(all(part and name for part, _, name in pairs), f"is {text!r:.80}, want PART=COLUMN,...")
-    return {part.strip(): name for part, _, name in pairs}
-
-
 def _square(text: str) -> tuple[float, ...]:
     from parkenv.lots.local_frame import LocalFrame
 
@@ -240,12 +234,12 @@ class Import(Command):
         takes="REGISTER",
         default="none",
     )
-    columns: dict[str, str] = option(
-        {},
+    columns: str | None = option(
+        None,
         "Columns of the register, by part: bay (its id), lat, lon, line, street, capacity, cars, limit, rate, hours, "
         "class, ... Several that are added up are joined by +.",
         takes="PART=COLUMN,...",
-        parse=_pairs,
+        parse=str,
         default="by usual names",
     )
     car_parks: Path | None = option(

@@ -85,6 +85,14 @@ def numbers_in(text: str, count: int | None = None) -> list[float]:
     return numbers
 
 
+def columns_in(text: str | None) -> dict[str, list[str]]:
+    """Convert names of columns by what they mean, `bay=Marker,taken=green+red`: those joined by + are added up."""
+    pairs = [word.partition("=") for word in (text or "").split(",") if word.strip()]
+    if not all(meaning.strip() and names.strip() for meaning, _, names in pairs):
+        raise InputError(f"columns is {text!r:.80}, want MEANING=COLUMN,... such as bay=Marker,time=When")
+    return {meaning.strip(): [name.strip() for name in names.split("+")] for meaning, _, names in pairs}
+
+
 def seconds_of_minutes(text: str) -> float:
     return 60.0 * numbers_in(text, 1)[0]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, naming
 from parkenv.files.limited_reading import csv_rows
+from parkenv.files.option import columns_in
 
 MAX_COUNT_BYTES = 512_000_000
 """Maximum size of a file of counts, unpacked."""
@@ -114,25 +115,21 @@ class Clock:
             return False
 
 
+def told(faults: Mapping[str, int]) -> str:
+    """Return in words how many rows or readings have each fault."""
+    return ", ".join(f"{rule.replace('_', ' ')} {n:,}" for rule, n in faults.items() if n)
+
+
 def folded(title: str) -> str:
     return re.sub(r"[\W_]+", "_", title.strip().casefold()).strip("_")
-
-
-def chosen(path: str | Path, columns: str | None) -> dict[str, list[str]]:
-    """Parse `KIND=COLUMN,...`; the values of a kind may be the sum of several columns, `taken=green+red`."""
-    pairs = [word.partition("=") for word in (columns or "").split(",") if word.strip()]
-    if not all(kind.strip() and title.strip() for kind, _, title in pairs):
-        raise InputError(
-            f"{path}: columns is {columns!r:.80}, want MEANING=COLUMN,... such as bay=Marker,time=When"
-        )
-    return {kind.strip(): [word.strip() for word in title.split("+")] for kind, _, title in pairs}
 
 
 def titled_rows(path: str | Path, columns: str | None = None) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a table, its header first, with the columns that the user names under what they mean."""
     rows = csv_rows(path, MAX_COUNT_BYTES)
     _, header = next(rows, (0, []))
-    named = chosen(path, columns)
+    with naming(path):
+        named = columns_in(columns)
     for title in (title for titles in named.values() for title in titles):
         if title not in header:
             raise InputError(f"{path}: has no column {title!r:.40}, but {', '.join(header)!r:.200}")

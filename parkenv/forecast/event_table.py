@@ -28,7 +28,8 @@ import numpy as np
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
-from parkenv.forecast.count_table import DAY_S, FIRST_DAY, HOUR_S, UNKNOWN, Clock, chosen, folded, titled_rows
+from parkenv.files.option import columns_in
+from parkenv.forecast.count_table import DAY_S, FIRST_DAY, HOUR_S, UNKNOWN, Clock, folded, titled_rows, told
 from parkenv.forecast.count_table import NAMES as COUNT_NAMES
 
 MAX_STATE_S = 72 * HOUR_S
@@ -52,10 +53,8 @@ _STATES = dict.fromkeys(
     ["0", "0.0", "false", "no", "vacant", "free", "unoccupied", "available", "empty", "absent", "frei"], False
 )
 _WANTED = "bay with arrival and departure, with since and state, or with time and state"
-_CHANGES, _MIN_PAIRS = (
-    0.95,
-    20,
-)  # share of rows that differ from the one before in a table of changes; rows to tell
+_CHANGES = 0.95  # share of rows that differ from the one before in a table of changes
+_MIN_PAIRS = 20  # to tell that
 _MIN_STAYS = 8  # to tell that a clock ends them
 
 
@@ -113,7 +112,7 @@ def _layout(header: Sequence[str]) -> tuple[str, int, list[_Part]] | None:
 def is_counts(path: str | Path, columns: str | None = None) -> bool:
     """Whether a table is not a log of bays."""
     _, header = next(titled_rows(path, columns))
-    kinds = {kind.removesuffix("_utc") for kind in chosen(path, columns)}
+    kinds = {kind.removesuffix("_utc") for kind in columns_in(columns)}
     whole = {name for kind in ("capacity", "free") for name in COUNT_NAMES[kind].split()}
     if kinds & {"car_park", "capacity", "free", "taken"} or whole & {folded(title) for title in header}:
         return True
@@ -128,7 +127,7 @@ def read_events(
     Args:
         paths: the tables.
         timezone: IANA name of the local time zone, wanted if times are in UTC or have an offset.
-        columns: names of columns that are not recognised, see `count_table.chosen`.
+        columns: names of columns that are not recognised, see `columns_in`.
 
     Raises:
         InputError: names the file, and the line and value where there is one.
@@ -150,8 +149,7 @@ def read_events(
     states = table.cleaned(_Rows(bay, start, end, values[:, 3] > 0))
     faults = {rule: n for rule, n in table.faults.items() if n}
     if not states[0].size:
-        told = ", ".join(f"{rule} {n:,}" for rule, n in faults.items())
-        raise InputError(f"{source}: has no states of bays, want some{told and f' ({told})'}")
+        raise InputError(f"{source}: has no states of bays, want some ({told(faults) or 'no row'})")
     return Events(tuple(table.bays), int(first) + FIRST_DAY, *states, faults)
 
 

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from parkenv.compiled.arrays import IntArray
-from parkenv.errors import InputError, naming, nearest, require_keywords
+from parkenv.errors import InputError, naming, nearest, require, require_keywords
 from parkenv.files.known_names import SAME_SLOTS
 from parkenv.files.option import parse_call
 from parkenv.files.user_class import load_class
+from parkenv.forecast.count_table import told
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
 from parkenv.scenarios.spec import (
     CountsSpec,
@@ -232,9 +233,9 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
 
         file = RecordedFile(tuple(spec.log), spec.timezone, None, spec.columns)
         if file.is_counts:
-            raise InputError(
-                f"{spec.log[0]}: is not a log of slots; want a table `counts` for counts of car parks"
-            )
+            require(len(spec.log) == 1, f"log is {len(spec.log)} files of counts, want one")
+            require(len(spec.car_parks or "1") == 1, "car_parks: want one")
+            return _occupancy(spec.as_counts(*(spec.car_parks or (None,))), lot, goal)
         log = _log(file, tuple(map(_changed, spec.log)))
         _warn_of_faults(log.faults, log.source)
         mapped = None
@@ -329,9 +330,9 @@ def _counted(occupancy: OccupancySpec, spec: CountsSpec, lot: ParkingLot, goal: 
 
 
 def _warn_of_faults(faults: Mapping[str, int], source: str) -> None:
-    told = ", ".join(f"{name} {n}" for name, n in faults.items() if n and name not in ("summer_time", "gap"))
-    if told:
-        warnings.warn(f"{source}: readings corrected or left out: {told}", stacklevel=2)
+    text = told({name: n for name, n in faults.items() if name not in ("summer_time", "gap")})
+    if text:
+        warnings.warn(f"{source}: readings corrected or left out: {text}", stacklevel=2)
 
 
 def _warn_of_counts(counts: Counts, row: int, source: str, *, is_stated: bool) -> None:

@@ -365,6 +365,14 @@ class OccupancySpec(Spec):
                 raise ValueError(wanted)
         return self
 
+    def as_counts(self, car_park: str | None) -> OccupancySpec:
+        """Return this occupancy with its log, a table of counts, as `counts` of a car park, or of the only one."""
+        assert self.log is not None
+        options = {name: getattr(self, name) for name in ("capacity", "timezone", "columns")}
+        moved = dict.fromkeys(("log", "car_parks", *options))
+        counts = {"file": self.log[0], "car_park": car_park, **options}
+        return self.changed("--car-park", **moved, counts=counts)
+
     def files(self) -> list[Path]:
         module = find_module(self.world) if self.world else None
         return [*super().files(), *([Path(module)] if module else [])]

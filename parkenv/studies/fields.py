@@ -16,7 +16,6 @@ from parkenv.files.option import Inside, Option, seconds_of_minutes, words_in
 from parkenv.files.spec_file import Axis, DetectorName, OrText, Several, require_together
 from parkenv.forecast.event_table import is_counts
 from parkenv.scenarios.spec import (
-    CountsSpec,
     ScenarioSpec,
     TrafficSpec,
     lot_scenario,
@@ -57,20 +56,18 @@ def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...
     """Replace scenarios that replay a file of counts by one for each of its car parks that are named."""
     listed: list[ScenarioSpec] = []
     for scenario in scenarios:
-        names, files = scenario.occupancy.car_parks, scenario.occupancy.log or ()
-        columns = scenario.occupancy.columns
-        if len(files) != 1 or (names is None and not is_counts(files[0], columns)):
+        recorded = scenario.occupancy
+        names, files = recorded.car_parks, recorded.log or ()
+        if len(files) != 1 or (names is None and not is_counts(files[0], recorded.columns)):
             listed.append(scenario)
             continue
-        options = ("capacity", "timezone", "columns")
-        counts: dict[str, Any] = {name: getattr(scenario.occupancy, name) for name in options} | {
-            "file": files[0]
-        }
-        if names == ("all",) and scenario.occupancy.mapping is None:
+        if names == ("all",) and recorded.mapping is None:
             from parkenv.scenarios.build import car_parks
 
-            names = tuple(car_parks(CountsSpec(**counts)))
-        if scenario.occupancy.mapping is not None:  # each car park on its own slots
+            counts = recorded.as_counts(None).counts
+            assert counts is not None
+            names = tuple(car_parks(counts))
+        if recorded.mapping is not None:  # each car park on its own slots
             names = None
         for name in names or (None,):
             title = (
@@ -78,13 +75,7 @@ def _by_car_park(scenarios: tuple[ScenarioSpec, ...]) -> tuple[ScenarioSpec, ...
                 if name is None
                 else file_name(f"{scenario.title} {name}").replace(",", " ")[:80]
             )
-            occupancy = scenario.occupancy.changed(
-                "--car-park",
-                log=None,
-                car_parks=None,
-                **dict.fromkeys(options),
-                counts={**counts, "car_park": name},
-            )
+            occupancy = recorded.as_counts(name)
             listed.append(scenario.changed("--car-park", name=title, occupancy=occupancy, forecast="own"))
     return tuple(listed)
 

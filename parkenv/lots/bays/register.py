@@ -22,6 +22,7 @@ from parkenv.compiled.arrays import BoolArray, IntArray
 from parkenv.errors import InputError, naming, nearest
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import csv_records, read_json, unpacked_path
+from parkenv.files.option import columns_in
 from parkenv.lots.formats.geojson import Positions
 
 SYNONYMS = {
@@ -89,12 +90,12 @@ class Register:
         return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
 
 
-def read_bays(path: str | Path, columns: Mapping[str, str] | None = None) -> Register:
+def read_bays(path: str | Path, columns: str | None = None) -> Register:
     """Read a register of bays.
 
     Args:
         path: `.csv`, `.json` or `.geojson`, also packed as `.gz` and `.bz2`.
-        columns: names of columns by part (`SYNONYMS`); several that are added up are joined by `+`.
+        columns: names of columns by part (`SYNONYMS`), see `columns_in`.
 
     Raises:
         InputError: the file cannot be read, or has no position or no bay.
@@ -106,9 +107,9 @@ def read_bays(path: str | Path, columns: Mapping[str, str] | None = None) -> Reg
             raise InputError("has no bay, want a row or a feature for each")
         names = list(dict.fromkeys(name for _, record, _ in records for name in record))
         own = dict(_usual(tuple(names)))
-        for part, text in (columns or {}).items():
-            own[part] = text.split("+")
-            for name, known in ((part, list(SYNONYMS)), *((name, names) for name in own[part])):
+        for part, chosen in columns_in(columns).items():
+            own[part] = chosen
+            for name, known in ((part, list(SYNONYMS)), *((name, names) for name in chosen)):
                 if name not in known:
                     raise InputError(f"--columns has {name!r:.40}; {nearest(name, known)}")
         if not own.keys() & {"line", "lat"} and unpacked_path(path).suffix.lower() == ".csv":

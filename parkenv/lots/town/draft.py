@@ -82,7 +82,6 @@ from parkenv.world.tariff import PUBLIC
 ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
 AROUND_BAYS = 0.003  # degrees of latitude, some 300 m, around the bays of a register: what is read of a map
 OFF_STREET = ("driveway", "parking_aisle")  # values of `service` of roads without bays at the kerb
-MOST_ZONES = 12  # that are printed
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
@@ -123,7 +122,7 @@ def import_town(
     car_parks: str | Path | None = None,
     *,
     bays: str | Path | None = None,
-    columns: Mapping[str, str] | None = None,
+    columns: str | None = None,
     bays_only: bool = False,
     listed_only: bool = False,
     bounds: tuple[tuple[float, float], tuple[float, float]] | None = None,
@@ -595,8 +594,6 @@ def _findings(
         yield f"{kind}s: {len(of_kind):,}, places: {sum(places.values()):,} ({listed or 'none'})"
     yield f"entries: {len(draft.entries)}, where streets cross the edge of the map"
     yield f"goals: {len(draft.goals)}, of {'streets' if along else 'buildings and points of interest'}"
-    rest = f", and {len(draft.zone_rules) - MOST_ZONES} more" if len(draft.zone_rules) > MOST_ZONES else ""
-    yield f"zones: {', '.join([*draft.zone_rules][:MOST_ZONES])}{rest}"
     yield from (f"of the list: {line}" for line in town.listed)
     yield from town.bays_found
     if town.n_bays:
