@@ -250,6 +250,9 @@ def test_the_command_writes_the_lot_and_what_is_left_out(tmp_path):
     assert "--columns wants --bays" in refused(
         "lot", "import", str(streets), "--columns", "lat=y", "--out", str(out)
     )
+    beside = ("lot", "import", str(streets), "--bays", str(bays), "--out", str(bays.with_suffix(".geojson")))
+    assert f"would replace {bays}, which is read" in refused(*beside)
+    assert len(rows_in(bays)) == 10
 
 
 def test_the_plain_import_of_outlines_keeps_their_ids(tmp_path):

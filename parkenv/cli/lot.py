@@ -329,8 +329,13 @@ class Import(Command):
             self.picture is None or self.picture.suffix.lower() == ".png",
             f"--picture {self.picture}: want a name that ends in .png",
         )
-        for file in (table if self._is_town else None, left_out_csv if self.bays else None, self.picture):
+        inputs = [path.resolve() for path in (self.place, self.bays, self.car_parks) if path is not None]
+        outputs = [self.out, unread_csv, self.picture, table if self._is_town else None]
+        for file in (*outputs, left_out_csv if self.bays else None):
             if file is not None:
+                require(
+                    file.resolve() not in inputs, f"--out {self.out}: would replace {file}, which is read"
+                )
                 check_writable(file)
         console = make_console(soft_wrap=True)
         if self._is_town:
