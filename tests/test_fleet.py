@@ -17,7 +17,16 @@ from test_counted_occupancy import counted
 from test_search_vector import recorded_scenario
 
 import parkenv
-from parkenv import ArrivalWindow, InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
+from parkenv import (
+    ArrivalWindow,
+    InputError,
+    OccupancyLog,
+    OccupancyProcess,
+    RecordedOccupancy,
+    Scenario,
+    SensorBand,
+    SensorModel,
+)
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.records import DUE, LEFT, PARKED, SEARCHING
 from parkenv.world.demand import (
@@ -237,6 +246,20 @@ def test_residents_leave_and_do_not_come_back():
     standing = fleet.taken() & (fleet.slots["car"] < 0)
     assert 0 < standing.sum() < before.sum()
     assert not (standing & ~before).any()
+
+
+def test_residents_of_a_recorded_day_leave_when_its_cars_did(tmp_path):
+    scenario, path = parkenv.make_scenario("mini"), tmp_path / "log.csv"
+    ends = [15 + k % 3 for k in range(scenario.lot.n_slots)]
+    path.write_text("bay,arrival,departure\n" + "".join(
+        f"{k},{day} {begin:02}:00,{day} {end:02}:00\n"
+        for day in ("2024-03-05", "2024-03-06") for k in range(len(ends)) for begin, end in ((7, ends[k]), (19, 21))
+    ))  # fmt: skip
+    log = RecordedOccupancy(OccupancyLog.read(path), scenario.walk_s, np.arange(len(ends)))
+    fleet = Fleet(scenario.replace(occupancy=log), Demand(Headways(1, 1.0)))
+    fleet.reset(0)
+    midnight = fleet.begin - fleet.begin % 86_400.0
+    np.testing.assert_allclose(fleet.slots["leaves_at"] - midnight, 3600.0 * np.array(ends), atol=1.0)
 
 
 def test_goals_and_entries_are_drawn_by_weight():

@@ -162,9 +162,11 @@ def find_end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, 
     if kind == PROCESS_KIND:
         find_sojourn_end(process_at(model, 0), world, slot, cursor)
         return float(cursor.valid_until)
+    end = time
     while cursor.occupied and cursor.valid_until < np.inf:
-        recorded_state(recorded_day_at(model, 0), slot, cursor, cursor.valid_until + 1e-3)
-    return float(np.inf if cursor.occupied else cursor.valid_until)
+        end = cursor.valid_until
+        recorded_state(recorded_day_at(model, 0), slot, cursor, end + 1e-3)
+    return float(np.inf if cursor.occupied else end)
 
 
 @inlined
