@@ -88,7 +88,7 @@ def test_ids_for_learners_that_take_no_options():
     same = gym.make("parkenv/Search-v2", scenario="mini", **OPTIONS)
     np.testing.assert_array_equal(env.reset(seed=2)[0], same.reset(seed=2)[0])
     assert env.step(3)[1:3] == same.step(3)[1:3]
-    envs = gym.make_vec("parkenv-flat/mini-v2", 2)
+    envs = gym.make_vec("parkenv-flat/all-v2", 2)
     assert envs.reset(seed=2)[0].shape == (2, 86)
 
 

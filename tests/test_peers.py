@@ -14,13 +14,14 @@ from test_model import numbers_in
 
 import parkenv
 from parkenv import InputError
+from parkenv.studies.simulate import adapt_to_agent
 from planners import make_agent
 
 PEERS = ("examples.peers.pomdp_py_agents:POUCT", "examples.peers.pomdp_py_agents:POMCP")
-OF_PAPERS = tuple(
-    f"examples.peers.{name}"
-    for name in ("lmu:ReplannedMDP", "mit:StopsAhead", "mit:Impatient", "mit:Patient")
-)
+PAPERS = ("lmu:ReplannedMDP", "mit:StopsAhead", "mit:Impatient", "mit:Patient")
+CLEANRL, MODEL = "examples.peers.cleanrl:PPO", "docs/leaderboard/models/cleanrl.safetensors"
+METHODS = {f"examples.peers.{name}": {} for name in PAPERS} | {CLEANRL: {"file": MODEL}}
+METHODS |= {name: {"simulations": 30} for name in PEERS}
 
 
 @pytest.fixture
@@ -29,49 +30,40 @@ def in_root(monkeypatch, request):
     monkeypatch.syspath_prepend(request.config.rootpath)
 
 
-@pytest.fixture
-def peers(in_root):
-    pytest.importorskip("pomdp_py", reason="needs the extra pomdp: pomdp-py")
-    return PEERS
-
-
 def totals(env, agent, n=8):
     return np.mean([parkenv.simulate(env, agent, seed=seed).info["total_s"] for seed in range(n)])
 
 
-def test_planners_of_pomdp_py_gain_on_the_heuristic_of_their_rollouts(peers):
+def agent_of(name, scenario, **options):
+    if name in PEERS:
+        pytest.importorskip("pomdp_py", reason="needs the extra pomdp: pomdp-py")
+    if name == CLEANRL:
+        pytest.importorskip("safetensors", reason="needs the extra rl: safetensors")
+    return make_agent(name, scenario, **METHODS[name] | options)
+
+
+def test_planners_of_pomdp_py_gain_on_the_heuristic_of_their_rollouts(in_root):
     scenario = parkenv.make_scenario("mini", day_error=0.8)
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     at_random = totals(env, make_agent("random", scenario))
-    for name in peers:
-        assert totals(env, make_agent(name, scenario, simulations=30, base="random")) < 0.6 * at_random
+    for name in PEERS:
+        assert totals(env, agent_of(name, scenario, simulations=30, base="random")) < 0.6 * at_random
 
 
-def test_planners_of_pomdp_py_are_seeded_and_leave_the_generator_of_python_alone(peers):
-    scenario = parkenv.make_scenario("mini", day_error=0.8)
-    env = gym.make("parkenv/Search-v2", scenario=scenario)
-    for name in peers:
-        found = []
-        for seed in (1, 2):
-            random.seed(seed)
-            state = random.getstate()
-            found.append(totals(env, make_agent(name, scenario, simulations=30), n=4))
-            assert random.getstate() == state
-        assert found[0] == found[1]
-
-
-def test_no_key_of_the_world_can_be_reached_from_their_memory(peers):
-    env = gym.make("parkenv/Search-v2", scenario=parkenv.make_scenario("mini"))
-    for name in peers:
-        agent, memory = make_agent(name, env.unwrapped.scenario, simulations=20), None
-        observation, _ = env.reset(seed=3)
-        for _ in range(2):
-            action, memory = agent.predict(observation, memory)
-            observation, *_ = env.step(action)
-        record = env.unwrapped.searches.records[0]
-        hidden = [record[key].tobytes() for key in ("key", "seed_state")]
-        roots = (agent, memory, memory.agent.belief, memory.planner)
-        assert not any(key in found for found in numbers_in(*roots) for key in hidden)
+@pytest.mark.parametrize("name", METHODS)
+def test_no_key_of_the_world_can_be_reached_from_their_memory(in_root, name):
+    scenario, memory = parkenv.make_scenario("mini"), None
+    agent = agent_of(name, scenario)
+    env = adapt_to_agent(gym.make("parkenv/Search-v2", scenario=scenario), agent)
+    observation, _ = env.reset(seed=3)
+    for _ in range(2):
+        action, memory = agent.predict(observation, memory)
+        observation, *_ = env.step(action)
+    record = env.unwrapped.searches.records[0]
+    hidden = [record[key].tobytes() for key in ("key", "seed_state")]
+    roots = (agent, memory, *((memory.agent.belief, memory.planner) if name in PEERS else ()))
+    assert not any(key in found for found in numbers_in(*roots) for key in hidden)
+    assert name == CLEANRL or type(agent.problem) is parkenv.world.scenario.SearchProblem
 
 
 def test_a_budget_that_no_agent_takes_is_refused(tmp_path):
@@ -86,49 +78,36 @@ def test_a_budget_that_no_agent_takes_is_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_methods_of_papers_search_and_are_seeded(in_root):
-    scenario = parkenv.make_scenario("mini", day_error=0.8)
+@pytest.mark.parametrize("name", METHODS)
+def test_methods_of_others_search_and_are_seeded(in_root, name):
+    scenario, found = parkenv.make_scenario("mini", day_error=0.8), []
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     least = {name: totals(env, make_agent(name, scenario), 4) for name in ("belief", "random")}
-    for name in OF_PAPERS:
-        found = [totals(env, make_agent(name, scenario), 4) for _ in range(2)]
-        assert found[0] == found[1]
-        assert found[0] < least["random"] or name.endswith("Patient")
-        if name.endswith(("StopsAhead", "ReplannedMDP")):
-            assert found[0] < least["belief"] + 3.0
-
-
-def test_an_agent_of_a_paper_reaches_no_hidden_state(in_root):
-    env = gym.make("parkenv/Search-v2", scenario=parkenv.make_scenario("mini"))
-    for name in OF_PAPERS:
-        agent = make_agent(name, env.unwrapped.scenario)
-        assert type(agent.problem) is parkenv.world.scenario.SearchProblem
-        observation, _ = env.reset(seed=3)
-        _, memory = agent.predict(observation, None)
-        record = env.unwrapped.searches.records[0]
-        hidden = [record[key].tobytes() for key in ("key", "seed_state")]
-        assert not any(key in found for found in numbers_in(agent, memory) for key in hidden)
+    for _ in range(2):
+        state = random.getstate()
+        agent = agent_of(name, scenario)
+        found.append(totals(adapt_to_agent(env, agent), agent, 4))
+        assert random.getstate() == state
+        random.seed(1)
+    assert found[0] == found[1]
+    assert found[0] < least["random"] or name.endswith("Patient")
+    if name.endswith(("StopsAhead", "ReplannedMDP")):
+        assert found[0] < least["belief"] + 3.0
 
 
 def test_stops_ahead_are_the_formulas_of_the_paper(in_root):
-    scenario, to_lot_s = parkenv.make_scenario("mini"), np.array([20.0, 10.0])
-    p, walk_s, drive_s = (
-        np.array([0.8, 0.5]),
-        np.array([30.0, 60.0]),
-        np.array([[300.0, 15.0], [12.0, 300.0]]),
-    )
-    expected = {}
+    scenario, to_lot_s, expected = parkenv.make_scenario("mini"), np.array([20.0, 10.0]), {}
+    p, walk_s = np.array([0.8, 0.5]), np.array([30.0, 60.0])
+    drive_s = np.array([[300.0, 15.0], [12.0, 300.0]])
     for stops in (1, 2, 3):
         agent = make_agent("examples.peers.mit:StopsAhead", scenario, stops=stops)
         agent.cost_s, agent.between_s = walk_s, drive_s
         expected[stops] = agent.expected_s(to_lot_s, p)
     assert expected[1] == pytest.approx([20 / 0.8 + 30, 10 / 0.5 + 60])
-    second = [min(300 / 0.8 + 30, 15 / 0.5 + 60), min(12 / 0.8 + 30, 300 / 0.5 + 60)]
-    assert expected[2] == pytest.approx([20 + 0.8 * 30 + 0.2 * second[0], 10 + 0.5 * 60 + 0.5 * second[1]])
-    third = [
-        min(drive_s[i, j] + p[j] * walk_s[j] + (1 - p[j]) * second[j] for j in range(2)) for i in range(2)
-    ]
-    assert expected[3] == pytest.approx([20 + 0.8 * 30 + 0.2 * third[0], 10 + 0.5 * 60 + 0.5 * third[1]])
+    second = (drive_s / p + walk_s).min(axis=1)
+    assert expected[2] == pytest.approx(to_lot_s + p * walk_s + (1 - p) * second)
+    third = (drive_s + p * walk_s + (1 - p) * second).min(axis=1)
+    assert expected[3] == pytest.approx(to_lot_s + p * walk_s + (1 - p) * third)
     with pytest.raises(InputError, match="stops is 4"):
         make_agent("examples.peers.mit:StopsAhead", scenario, stops=4)
 
@@ -149,9 +128,8 @@ def test_the_mdp_of_bays_is_the_best_order_of_them(in_root):
         cost_s, wait_s = rng.uniform(5, 60, n), rng.uniform(100, 200, n)
         found = lmu.best_times(list(lmu.sets_of(n)), between_s, p, cost_s, wait_s)
         orders = [(0, *rest[:k]) for rest in permutations(range(1, n)) for k in range(n)]
-        assert found[0b0001, 0] == pytest.approx(
-            min(time_in_order(bays, between_s, p, cost_s, wait_s) for bays in orders)
-        )
+        times_s = [time_in_order(bays, between_s, p, cost_s, wait_s) for bays in orders]
+        assert found[0b0001, 0] == pytest.approx(min(times_s))
 
 
 def test_bays_are_markov_chains_to_the_moment_of_arrival(in_root):
@@ -172,17 +150,25 @@ def test_cars_of_a_fleet_that_share_reserve_and_adapt(in_root):
         assert min(times_s) > 0.0
 
 
+def test_a_file_without_a_policy_of_cleanrl_is_refused(in_root, tmp_path):
+    safetensors = pytest.importorskip("safetensors.numpy", reason="needs the extra rl: safetensors")
+    scenario, file = parkenv.make_scenario("mini"), tmp_path / "cut.safetensors"
+    cut = {name: values[:3].copy() for name, values in safetensors.load_file(MODEL).items()}
+    safetensors.save_file(cut, file)
+    with pytest.raises(InputError, match=r"its weights and biases are \[\(86, 3\), \(3,\)"):
+        make_agent(CLEANRL, scenario, file=file)
+    with pytest.raises(InputError, match=r"no actor of CleanRL's ppo.py: '0.weight'"):
+        make_agent(CLEANRL, scenario, file=MODEL.replace("cleanrl", "maskable-ppo"))
+
+
 PIPED = "examples.peers.in_another_environment:Piped"
 SERVER = """
 import json, sys, time
 print('hello', file=sys.stderr)
 for line in sys.stdin:
     message = json.loads(line)
-    if 'problem' in message:
-        print(json.dumps({'ready': True}), flush=True)
-        continue
-    mask = message['observation']['action_mask']
-    print(ANSWER, flush=True)
+    mask = message.get('observation', {}).get('action_mask')
+    print(ANSWER if mask else json.dumps({'ready': True}), flush=True)
 """
 
 

@@ -6,17 +6,17 @@ from importlib.metadata import version
 
 import gymnasium as gym
 
-import parkenv  # noqa: F401 - registers the environments
+import parkenv.envs.flat_ids
 
 WORLDS = range(1_000_000, 1_000_300)
 """Seeds of the worlds."""
-OPTIONS = {"observation": "local", "flat": True, "reward_scale": 0.01, "max_episode_steps": 500}
+OPTIONS = parkenv.envs.flat_ids.OPTIONS | {"max_episode_steps": 500}
 """Of `gymnasium.make("parkenv/Search-v2")`: what most learners train on."""
 
 
 def make(scenario, **options):
     """Make the environment of a learner; a search that drives in circles is stopped after 500 steps."""
-    return gym.make("parkenv/Search-v2", scenario=scenario, **OPTIONS | options)
+    return gym.make(f"parkenv-flat/{scenario}-v2", **OPTIONS | options)
 
 
 def totals(act, env):
@@ -39,7 +39,7 @@ def tell(library, decisions, act, scenario, release=None, **options):
         library: its name as a package.
         decisions: of the training, which this process did before and nothing else.
         act: draws the action for an observation.
-        scenario: a packaged car park.
+        scenario: a packaged car park, or `all` of them.
         release: its version, if it is no package.
         options: changes of `OPTIONS`.
     """

@@ -1,6 +1,7 @@
 """PPO of CleanRL, its file as it is: `python with_cleanrl.py SCENARIO DECISIONS PPO.PY`.
 
-It trains on an id alone, without options, and keeps no model: what its file has learned is in its names at the end.
+It trains on an id alone, without options, and keeps no model: what its file has learned is in its names at the end. The
+policy goes to `cleanrl.safetensors`, which `examples/peers/cleanrl.py` plays.
 """
 
 import hashlib
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import torch
 from held_out import tell
+from safetensors.torch import save_file
 
 SCENARIO, DECISIONS, FILE = sys.argv[1], int(sys.argv[2]), sys.argv[3]
 
@@ -19,6 +21,7 @@ sys.argv = [
     "--num-envs", "32", "--num-steps", "64", "--gamma", "0.999", "--learning-rate", "1e-3", "--no-cuda",
 ]  # fmt: skip
 agent = runpy.run_path(FILE, run_name="__main__")["agent"]
+save_file(agent.actor.state_dict(), "cleanrl.safetensors")
 
 tell(
     "cleanrl",

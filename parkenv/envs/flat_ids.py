@@ -1,7 +1,7 @@
 """Ids for learners that take an id and no options: a packaged car park, one vector as observation, small rewards.
 
-Importing this module registers `parkenv-flat/NAME-v2` for campus, jam, street and mini. Gymnasium imports it where an
-id names it, so a learner's own command needs no more than that id:
+Importing this module registers `parkenv-flat/NAME-v2` for campus, jam, street, mini and kerbs, and `all`, in which each
+search is in one of them. Gymnasium imports it where an id names it, so a learner's own command needs only that id:
 
 >>> import gymnasium as gym
 >>> env = gym.make("parkenv.envs.flat_ids:parkenv-flat/mini-v2")
@@ -11,21 +11,14 @@ id names it, so a learner's own command needs no more than that id:
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import gymnasium as gym
 
-OPTIONS: dict[str, Any] = {"observation": "local", "flat": True, "reward_scale": 0.01}
+OPTIONS = {"observation": "local", "flat": True, "reward_scale": 0.01}
 """Of `gymnasium.make("parkenv/Search-v2", ...)`, besides the scenario."""
 
-_search = gym.spec("parkenv/Search-v2")
-for _name in ("campus", "jam", "street", "mini"):
-    if f"parkenv-flat/{_name}-v2" not in gym.registry:
-        gym.register(
-            id=f"parkenv-flat/{_name}-v2",
-            entry_point=_search.entry_point,
-            vector_entry_point=_search.vector_entry_point,
-            max_episode_steps=_search.max_episode_steps,
-            order_enforce=_search.order_enforce,
-            kwargs={"scenario": _name, **OPTIONS},
-        )
+LOTS = ["campus", "jam", "street", "mini", "kerbs"]
+for _name, _scenario in [*zip(LOTS, LOTS, strict=True), ("all", LOTS)]:
+    _id, _kwargs = f"parkenv-flat/{_name}-v2", {"scenario": _scenario, **OPTIONS}
+    gym.registry.setdefault(_id, replace(gym.spec("parkenv/Search-v2"), id=_id, kwargs=_kwargs))
