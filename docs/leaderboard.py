@@ -37,7 +37,7 @@ def tables(folder):
     ]
     made = {"ranking": "\n".join(lines), "pairs": "\n".join(pairs)}
     for agent in (row["agent"] for row in rows):
-        brief = re.sub(r":[^()]*[/\\]", ":", agent)  # without the folders of its file
+        brief = re.sub(r"([:=])[^()]*[/\\]", r"\1", agent)  # without the folders of its file
         made = {name: table.replace(agent, brief) for name, table in made.items()}
     return made
 
