@@ -117,9 +117,10 @@ def require_recordable(path: Path) -> None:
 
 
 def record_drive(survey: Survey, number: int, path: Path) -> None:
-    with recording(path, survey.pipeline.rig) as writer:
-        driven = survey.drive(
-            number, on_frame=lambda frame: writer.add(frame.result.captured, frame.odometry)
-        )
-        session = driven.session
-        writer.close(Head(**{name: getattr(session, name) for name in ("key", "time", "rig", "weather")}))
+    """Record what the sensors measure in a session, which is driven again; nothing is detected."""
+    drive = survey.draw(number)
+    with recording(path, drive.rig) as writer:
+        for i, time in enumerate(drive.times.tolist()):
+            writer.add(TimedCapture(time, drive.capture(i)[1]), drive.odometry[i])
+        key, rig = survey.key_of(number), survey.settings.rig
+        writer.close(Head(key=key, time=drive.arrival.time, rig=rig, weather=drive.preset))
