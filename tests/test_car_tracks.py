@@ -90,6 +90,35 @@ def test_walls_cars_on_their_way_and_unlikely_boxes_are_no_parked_cars():
     assert np.allclose(tracks.cars(TRACK).xy, [[80.0, 5.0]], atol=0.2)
 
 
+def test_what_is_as_long_as_a_car_is_one_even_if_its_boxes_are_unsure():
+    tracks = CarTracks()
+    for k in range(2):
+        whole, corner = (outline(x, 5.0, 0.0, length, 1.8, "r") for x, length in ((20.0, 4.4), (40.0, 2.5)))
+        tracks.add(float(k), sighting(whole, (20.0, 5.0), 0.0, 0.3, (15.0 + k, 0.0)))
+        tracks.add(float(k), sighting(corner, (40.0, 5.0), 0.0, 0.3, (35.0 + k, 0.0)))
+    cars = tracks.cars(TRACK)
+    assert np.allclose(cars.xy, [[20.0, 5.0]], atol=0.2)
+    assert 0.5 < cars.probability[0] < 0.8
+
+
+def test_boxes_of_parts_of_a_flank_are_of_one_car():
+    """The boxes end at two parts of a flank, taken for a front each; the end points go on."""
+    tracks, flank = CarTracks(), outline(20.0, 5.0, 0.0, 4.4, 1.8, "r")
+    for k, x in enumerate((18.6, 21.3, 19.0)):
+        tracks.add(float(k), sighting(flank, (x, 6.3), math.pi / 2, 0.9, (19.0 + k, 0.0)))
+    cars = tracks.cars(TRACK)
+    assert np.allclose(cars.xy, [[20.0, 5.0]], atol=0.1)
+    assert cars.sightings.tolist() == [3]
+
+
+def test_sightings_that_agree_in_no_point_have_a_place():
+    tracks = CarTracks()
+    for k, side in enumerate("rbf"):
+        points = outline(20.0, 5.0, 0.0, 4.4, 1.8, side)[12:-12]
+        tracks.add(float(k), sighting(points, (20.0, 5.0), 0.0, 0.9, (10.0 + 8 * k, 0.0)))
+    assert np.allclose(tracks.cars(TRACK).xy, [[20.0, 5.0]], atol=0.3)
+
+
 def test_a_car_askew_in_a_row_takes_the_heading_of_the_row():
     tracks = CarTracks()
     for k in range(5):

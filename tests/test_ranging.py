@@ -129,6 +129,7 @@ def test_a_neighbour_at_the_margin_does_not_count_and_a_run_goes_on_where_the_im
     inside = beams_between(scan, -math.pi / 2 + 0.2, -math.pi / 2 - 0.2)
     short, whole = car_beams(scan, inside), car_beams(scan, inside, (True, True))
     assert set(short.beams) <= set(inside)
+    assert set(short.run) == set(whole.beams), "the beams that go on beyond the box are known"
     ends = scan.points(whole.beams[[0, -1]])[:, 0]
     assert ends == pytest.approx([-2.2, 2.2], abs=0.05)
 

@@ -16,17 +16,17 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.perception.box_fit import CAR_WIDTH, LONG_SIDE, direction_of
+from parkenv.perception.box_fit import CAR_WIDTH, LONG_SIDE, direction_of, fit_box
 from parkenv.perception.pipeline import CameraView
-from parkenv.perception.ranging import LocatedCars
+from parkenv.perception.ranging import LONGEST, WIDEST, LocatedCars
 
 CAR_LENGTH = 4.1  # m, of cars whose ends have not both been seen: between KITTI's mean of 3.9 and today's 4.3
-LONGEST, WIDEST = 5.5, 2.4  # m; what is longer is a wall or a hedge
 LEAST_PROBABILITY = 0.5  # of a car that is listed
 _GATE = (2.6, 1.3)  # m along and across a car within which a sighting is of it
 _SPREADS = 3.0  # standard deviations of a sighting from one picture, within which it is of a car
 _OVERLAP = (2.8, 1.3)  # m along and across, between the middles of two cars that cannot both be there
 _SHARE = 0.6  # weight of a sighting as evidence that there is a car: boxes of one thing resemble
+_WHOLE_RATIO = 4.0  # likelihood ratio of a car's length in end points: walls and hedges seldom have it
 _UNPLACED_M = 1.5  # m; sightings from pictures with a larger standard deviation say too little
 _MOVED_M = 2.2  # m between the first and the last third of a car's sightings, beyond which it was on its way
 _WHOLE_LENGTH, _WHOLE_WIDTH = 3.3, 1.5  # m, sides seen so far are seen from end to end
@@ -35,14 +35,8 @@ _EDGES = (3.0, 97.0)  # percentiles of the end points where a car's sides are
 _CELL_M = 0.05  # one end point in so large a cell counts
 _ROW_M, _ROW_CARS, _ROW_AGREES = 25.0, 3, 0.5  # m around a car in which so many others agree in heading
 _ASKEW = math.radians(10.0)
-_SIGHTING_STD, _PART_STD = (
-    (0.25, 0.25),
-    (0.6, 0.35),
-)  # m along and across, of a sighting of a flank, and of less
-_SEEN_STD, _ASSUMED_STD = (
-    0.14,
-    0.4,
-)  # m, of a centre between two seen ends, and of one that is half a usual car away
+_FLANK_STD, _PART_STD = (0.25, 0.25), (0.6, 0.35)  # m along and across, of a sighting of a flank, and of less
+_SEEN_STD, _ASSUMED_STD = 0.14, 0.4  # m, of a centre between two seen ends, and half a usual car from one
 _COMMON_STD = 0.12  # m, of errors that all sightings share, as that of poses
 _COMMON_SHARE = 0.8  # the same of sightings from pictures, as a fraction of the mean one
 
@@ -113,8 +107,12 @@ class _Track:
 
     @property
     def chance(self) -> float:
-        """P(there is a car), from boxes that tell less together than if they were independent."""
-        return float(1.0 - np.prod((1.0 - np.clip(self.probability, 0.0, 0.999)) ** _SHARE))
+        """P(there is a car), from boxes that tell less together than if they were independent, and from its length."""
+        none = float(np.prod((1.0 - np.clip(self.probability, 0.0, 0.999)) ** _SHARE))
+        axis = np.array([math.cos(self.heading), math.sin(self.heading)])
+        lengths = [np.ptp(points @ axis) for points in self.points if len(points)]
+        ratio = _WHOLE_RATIO if any(_WHOLE_LENGTH <= length <= LONGEST for length in lengths) else 1.0
+        return ratio * (1.0 - none) / (ratio * (1.0 - none) + none)
 
     @property
     def has_moved(self) -> bool:
@@ -142,12 +140,17 @@ class CarTracks:
     def add(self, time: float, view: CameraView) -> None:
         """Add the cars of one view; each is of a car that is there already, or a new one."""
         cars, open_tracks = view.cars, list(self._tracks)
+        eye = np.array([view.scan.x, view.scan.y])
         for k in np.argsort(-cars.probability, kind="stable").tolist():
-            yaw = float(cars.yaw[k])
+            xy, yaw = cars.xy[k], float(cars.yaw[k])
             if cars.covariance is None:
                 points, gate = cars.points[k], _GATE
+                fitted = _Place(xy[0], xy[1], yaw, cars.size[k, 0], cars.size[k, 1], 0.0)
+                if (fitted.distances(points) > _CELL_M).any():
+                    car = fit_box(points, eye, end_on=False)  # the box was too small
+                    xy, yaw = np.array([car.x, car.y]), car.yaw
                 is_flank = bool(np.ptp(points @ [math.cos(yaw), math.sin(yaw)]) > LONG_SIDE)
-                covariance = _turned(yaw, _SIGHTING_STD if is_flank else _PART_STD)
+                covariance = _turned(yaw, _FLANK_STD if is_flank else _PART_STD)
             else:
                 points, is_flank, covariance = np.empty((0, 2)), True, cars.covariance[k]
                 std = math.sqrt(float(np.linalg.eigvalsh(covariance).max()))
@@ -155,18 +158,18 @@ class CarTracks:
                     continue
                 spread = _SPREADS * std
                 gate = (min(_GATE[0], spread), min(_GATE[1], spread))
-            off = [track.off(cars.xy[k], gate) for track in open_tracks]
+            off = [track.off(xy, gate) for track in open_tracks]
             if min(off, default=math.inf) < 1.0:
                 track = open_tracks.pop(int(np.argmin(off)))
             else:
                 self._tracks.append(track := _Track())
             track.times.append(time)
-            track.xy.append(cars.xy[k])
+            track.xy.append(xy)
             track.covariance.append(covariance)
             track.yaw.append((yaw, 1.0 if is_flank else 0.1))
             track.probability.append(float(cars.probability[k]))
             track.points.append(points)
-            track.eyes.append(np.array([view.scan.x, view.scan.y]))
+            track.eyes.append(eye)
 
     def cars(self, way: FloatArray, least: float = LEAST_PROBABILITY) -> ParkedCars:
         """Return the cars that are there with a probability of at least `least`, and that stood still.
@@ -252,7 +255,7 @@ def _agreed(parts: Sequence[FloatArray]) -> FloatArray:
     seen = np.zeros(len(everything))
     for part in parts:
         seen += cKDTree(part).query(everything)[0] < _AGREED_M
-    agreed: FloatArray = everything[seen >= max(2.0, 0.25 * seen.max())]
+    agreed: FloatArray = everything[seen >= min(max(2.0, 0.25 * seen.max()), seen.max())]
     return agreed
 
 

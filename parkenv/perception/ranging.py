@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.errors import InputError
-from parkenv.perception.box_fit import CAR_LENGTH, CAR_WIDTH, LONG_SIDE, fit_box
+from parkenv.perception.box_fit import CAR_LENGTH, CAR_WIDTH, LONG_SIDE, direction_of, fit_box
 from parkenv.perception.range_scan import RangeScan
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.rig import Mount
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from parkenv.perception.detector import Detections
 
 
+LONGEST, WIDEST = 5.5, 2.4  # m; what is longer is a wall or a hedge
 GAP = 0.5  # m; neighbouring beams whose end points are farther apart belong to different objects
 WHOLE_END = 1.2  # m; a visible edge of this length is the front or rear of a car, not a part of its side
 OFF_GROUND = 0.7  # m; tolerance of the height of a box's lower edge above or below the ground
@@ -106,6 +107,7 @@ class CarBeams(NamedTuple):
     # whether the car extends beyond the first and beyond the last of them, where it is occluded or outside the
     # sensor's field of view
     cut: tuple[bool, bool]
+    run: NDArray[np.int64]  # (m,) int64, these and those beside the box that go on without a gap
 
 
 def car_beams(
@@ -122,7 +124,7 @@ def car_beams(
     met = np.flatnonzero(np.isfinite(scan.distance))
     inside = np.flatnonzero(np.isin(met, beams))
     if len(inside) < _LEAST_BEAMS:
-        return CarBeams(met[:0], (False, False))
+        return CarBeams(met[:0], (False, False), met[:0])
     step = np.diff(scan.points(met), axis=0)
     run = np.r_[0, np.cumsum(np.hypot(step[:, 0], step[:, 1]) > GAP)]
     off = np.abs(_wrapped(scan.angle[met[inside]] - 0.5 * (scan.angle[beams[0]] + scan.angle[beams[-1]])))
@@ -134,12 +136,12 @@ def car_beams(
     first = ends[0] if goes_on[0] else inside[0]
     last = ends[-1] if goes_on[1] else inside[-1]
     if last - first + 1 < _LEAST_BEAMS:
-        return CarBeams(met[:0], (False, False))
+        return CarBeams(met[:0], (False, False), met[:0])
     cut = (
         goes_on[0] and _hidden(scan.distance[: met[first] + 1][::-1]),
         goes_on[1] and _hidden(scan.distance[met[last] :]),
     )
-    return CarBeams(met[first : last + 1], cut)
+    return CarBeams(met[first : last + 1], cut, met[ends])
 
 
 def median_depth(disparity_px: Float32Array, box: Float32Array, stereo: StereoCamera) -> float:
@@ -178,7 +180,7 @@ def localize_cars(
             bool(detections.boxes[i, 2] >= (1.0 - MARGIN) * camera.width),
             bool(detections.boxes[i, 0] <= MARGIN * camera.width),
         )
-        beams, cut = car_beams(scan, beams_between(scan, left, right), clipped)
+        beams, cut, run = car_beams(scan, beams_between(scan, left, right), clipped)
         if not len(beams) or explained[beams].mean() >= _EXPLAINED:
             continue
         low, high = _heights(detections.boxes[i], float(np.median(scan.distance[beams])), camera, mount)
@@ -194,7 +196,7 @@ def localize_cars(
         explained[beams] = True
         rows.append(i)
         cars.append(car)
-        points.append(ends)
+        points.append(_whole(ends, scan.points(run)))
         distances.append(float(np.median(scan.distance[beams])))
     if not rows:
         return LocatedCars.none()
@@ -207,6 +209,15 @@ def localize_cars(
         np.array(rows, dtype=np.int64),
         points=tuple(points),
     )
+
+
+def _whole(ends: FloatArray, run: FloatArray) -> FloatArray:
+    """Return the end points of a run, if they are no more than a car: its box is too small; else those in the box."""
+    if len(run) > len(ends):
+        yaw = direction_of(run)
+        sides = np.sort([np.ptp(run @ [math.cos(a), math.sin(a)]) for a in (yaw, yaw + 0.5 * math.pi)])
+        return run if sides[1] <= LONGEST and sides[0] <= WIDEST else ends
+    return ends
 
 
 def localize_median(
