@@ -76,7 +76,7 @@ def test_a_gap_that_may_be_a_side_street_is_filled_only_where_scans_show_it_free
 
 def test_no_row_crosses_a_driven_street_and_no_slot_is_where_the_car_drove():
     corner = np.concatenate([TRACK[:40], [[39.0, -20.0]]])
-    found = discover_street([cars_at([*along(30.0, 48.0), (20.0, 0.4)])], [corner])
+    found = discover_street([cars_at([*along(30.0, 48.0), (20.0, 0.4), (15.0, 1.1)])], [corner])
     assert not places(found, GAP)
     assert (found.source == LONE_CAR).all()
 
@@ -86,6 +86,12 @@ def test_a_car_with_a_wrong_heading_is_of_the_row_that_it_stands_in():
     found = discover_street([cars], [TRACK])
     assert (found.source == CAR).all()
     assert np.abs(found.slots.yaw).max() < 0.1
+
+
+def test_a_car_between_two_rows_does_not_join_them():
+    rows = along(10.0, 12.5, 15.0, 17.5, 20.0, y=-6.0) + along(24.0, 26.5, 29.0, 31.5, 34.0, y=-7.8)
+    found = discover_street([cars_at([*rows, (22.0, -6.9)], math.pi / 2)], [TRACK])
+    assert {(10.0, -6.0), (34.0, -7.8)} <= set(map(tuple, found.slots.xy.round(1).tolist()))
 
 
 def test_what_may_have_moved_is_no_slot_or_a_guess():

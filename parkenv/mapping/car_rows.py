@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.mapping.car_tracks import ParkedCars
@@ -38,15 +36,20 @@ def car_rows(cars: ParkedCars, path: shapely.MultiLineString) -> list[CarRow]:
     step = cars.xy[None] - cars.xy[:, None]
     away = np.stack([(step * axis_of(middle + quarter)).sum(axis=2) for quarter in (0.0, math.pi / 2)])
     alike = np.abs(_turn((cars.yaw - heading)[None] - (cars.yaw - heading)[:, None])) < _ALIKE
-    linked = (np.abs(away) <= np.array(LINK_M)[:, None, None]).all(axis=0) & alike & (np.abs(turn) < _ALIKE)
+    reach = alike & (np.abs(turn) < _ALIKE) & (np.abs(away[0]) <= LINK_M[0])
+    linked = reach & (np.abs(away[1]) <= LINK_M[1])
     one, other = np.nonzero(np.triu(linked, 1))
     segments = np.asarray(shapely.linestrings(np.stack([cars.xy[one], cars.xy[other]], axis=1)))
     crossing = shapely.intersects(segments, path) if len(one) else np.zeros(0, np.bool_)
-    one, other = one[~crossing], other[~crossing]
-    count, label = connected_components(
-        csr_array((np.ones(len(one)), (one, other)), shape=(n, n)), directed=False
-    )
-    size = np.bincount(label, minlength=count)
+    linked[one[crossing], other[crossing]] = linked[other[crossing], one[crossing]] = False
+    votes = linked.astype(np.int64) - (reach & (np.abs(away[1]) > JOIN_M[1]))
+    label, order = np.arange(n), np.argsort(np.hypot(*(cars.xy[one] - cars.xy[other]).T), kind="stable")
+    for a, b in np.stack([one, other], axis=1)[order[~crossing[order]]].tolist():
+        # A car between two rows, such as one on its way, must not make them one.
+        first, second = label == label[a], label == label[b]
+        if label[a] != label[b] and votes[np.ix_(first, second)].sum() > 0:
+            label[second] = label[a]
+    size = np.bincount(label, minlength=n)
     # A car seen from the front or at an angle may have a wrong heading: its place tells which row it is of.
     near = (np.abs(away) <= np.array(JOIN_M)[:, None, None]).all(axis=0)
     least = np.where(np.abs(_turn(cars.yaw - heading)) < _ACROSS, 4.0, 2.0)

@@ -76,7 +76,8 @@ def discover_street(
     if path.is_empty:
         raise InputError("the drives have no track, want poses at two places at least")
     cars = joined(drives)
-    cars = _chosen(cars, (cars.std <= MOST_STD_M) & (cars.probability >= 0.5))
+    is_beside = np.asarray(shapely.distance(shapely.points(cars.xy), path)) > _CORRIDOR_M
+    cars = _chosen(cars, (cars.std <= MOST_STD_M) & (cars.probability >= 0.5) & is_beside)
     cars = _chosen(cars, np.argsort(cars.std, kind="stable"))
     if len(cars.xy):
         cars = _same_cars_joined(aligned(cars, car_rows(cars, path)))
