@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.perception.box_fit import CAR_WIDTH, LONG_SIDE, direction_of, fit_box
 from parkenv.perception.pipeline import CameraView
-from parkenv.perception.ranging import LONGEST, WIDEST, LocatedCars
+from parkenv.perception.ranging import LONGEST, LocatedCars
 
 CAR_LENGTH = 4.1  # m, of cars whose ends have not both been seen: between KITTI's mean of 3.9 and today's 4.3
 LEAST_PROBABILITY = 0.5  # of a car that is listed
@@ -30,7 +29,6 @@ _WHOLE_RATIO = 4.0  # likelihood ratio of a car's length in end points: walls an
 _UNPLACED_M = 1.5  # m; sightings from pictures with a larger standard deviation say too little
 _MOVED_M = 2.2  # m between the first and the last third of a car's sightings, beyond which it was on its way
 _WHOLE_LENGTH, _WHOLE_WIDTH = 3.3, 1.5  # m, sides seen so far are seen from end to end
-_AGREED_M = 0.15  # m; end points of sightings this close agree
 _EDGES = (3.0, 97.0)  # percentiles of the end points where a car's sides are
 _CELL_M = 0.05  # one end point in so large a cell counts
 _ROW_M, _ROW_CARS, _ROW_AGREES = 25.0, 3, 0.5  # m around a car in which so many others agree in heading
@@ -240,23 +238,7 @@ def _placed(track: _Track, heading: float | None = None) -> _Place:
         std = math.hypot(math.sqrt(np.trace(track.own) / 2.0), _COMMON_SHARE * mean)
         x, y = track.middle.tolist()
         return _Place(x, y, track.heading if heading is None else heading, CAR_LENGTH, CAR_WIDTH, std)
-    place = _fitted(_agreed(track.points), np.array(track.eyes), track.heading, heading)
-    if place.width > WIDEST:  # end points of two things: the car is where most sightings have it
-        x, y = np.median(track.xy, axis=0).tolist()
-        return _Place(x, y, track.heading, CAR_LENGTH, CAR_WIDTH, 2.0 * _ASSUMED_STD)
-    return place
-
-
-def _agreed(parts: Sequence[FloatArray]) -> FloatArray:
-    """Return the end points near which at least two sightings, and a quarter of the most, have some."""
-    everything = np.concatenate(parts)
-    if len(parts) < 3:
-        return everything
-    seen = np.zeros(len(everything))
-    for part in parts:
-        seen += cKDTree(part).query(everything)[0] < _AGREED_M
-    agreed: FloatArray = everything[seen >= min(max(2.0, 0.25 * seen.max()), seen.max())]
-    return agreed
+    return _fitted(np.concatenate(track.points), np.array(track.eyes), track.heading, heading)
 
 
 def _fitted(points: FloatArray, eyes: FloatArray, heading: float, given: float | None) -> _Place:
