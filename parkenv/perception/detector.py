@@ -171,6 +171,15 @@ class BandDetector(Protocol):
     def detect_on_ground(self, image: Image, band: GroundBand) -> Detections: ...
 
 
+def detect_in(detector: Detector, image: Image, band: GroundBand) -> Detections:
+    """Find the cars in an image; a detector that can do so looks only where they can be."""
+    return (
+        detector.detect_on_ground(image, band)
+        if isinstance(detector, BandDetector)
+        else detector.detect(image)
+    )
+
+
 def _checked(name: str, values: NDArray[np.floating], shape: tuple[int, ...]) -> Float32Array:
     array = np.asarray(values, dtype=np.float32)
     if array.shape != shape or not np.isfinite(array).all():

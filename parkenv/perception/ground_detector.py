@@ -8,7 +8,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
-from parkenv.perception.detector import BandDetector, Detections, Detector, GroundBand
+from parkenv.perception.detector import Detections, Detector, GroundBand, detect_in
 from parkenv.perception.ranging import CAR_HEIGHT, MARGIN, OFF_GROUND
 from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.rig import Mount
@@ -39,10 +39,7 @@ class GroundDetector:
         if image.shape[:2] != (camera.height, camera.width):
             size = f"{image.shape[1]}×{image.shape[0]}"
             raise InputError(f"a picture is {size} px, want {camera.width}×{camera.height} as calibrated")
-        if isinstance(self._detector, BandDetector):
-            found = self._detector.detect_on_ground(image, band)
-        else:
-            found = self._detector.detect(image)
+        found = detect_in(self._detector, image, band)
         _, top, _, bottom = found.boxes.T.astype(np.float64)
         height, below = bottom - top, bottom - band.horizon
         is_cut = bottom >= (1.0 - MARGIN) * camera.height

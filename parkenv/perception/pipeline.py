@@ -16,10 +16,10 @@ from parkenv.compiled.threads import ahead_in_threads, in_threads
 from parkenv.errors import InputError
 from parkenv.perception.detector import (
     PROBABILITY,
-    BandDetector,
     Detections,
     Detector,
     DetectorErrors,
+    detect_in,
 )
 from parkenv.perception.detector_registry import make_detector
 from parkenv.perception.ground_detector import ground_band
@@ -31,7 +31,7 @@ from parkenv.perception.ranging import (
     localize_disparity,
     localize_median,
 )
-from parkenv.perception.slot_filter import SlotFilter, SlotObservation
+from parkenv.perception.slot_filter import OCCLUDED, SlotFilter, SlotObservation
 from parkenv.world.lot import ParkingLot
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.rig import Capture, Mount, SensorRig, TimedCapture
@@ -118,7 +118,7 @@ class PerceptionPipeline:
         own = getattr(self.detector, "errors", DetectorErrors())
         self.errors = (errors or RangingErrors())._replace(detector=own.on_streets if on_streets else own)
         # On streets much resembles a car a little: hedges, walls, cars behind others.
-        self._hides_from = PROBABILITY if on_streets else 0.0
+        self._hides_from, self._occluded = (PROBABILITY, 0.2) if on_streets else (0.0, OCCLUDED)
         self._concurrent = getattr(self.detector, "concurrent", False)
 
     def process(
@@ -190,7 +190,7 @@ class PerceptionPipeline:
         for view in result.views:
             if view.hiding is not None:
                 ground = GroundView(view.camera, view.mount)
-                slots.update_from_picture(ground, result.vehicle, view.hiding, self.errors)
+                slots.update_from_picture(ground, result.vehicle, view.hiding, self.errors, self._occluded)
             views.append(dataclasses.replace(view, slots=slots.update_from_cars(view.cars)))
         return dataclasses.replace(result, views=tuple(views))
 
@@ -246,15 +246,9 @@ class PerceptionPipeline:
 
     def _detections(self, capture: Capture) -> dict[str, Detections]:
         return {
-            name: self._detect(image, camera, mount)  # T §3.2.1, §3.2.2
+            name: detect_in(self.detector, image, ground_band(camera, mount))  # T §3.2.1, §3.2.2
             for name, camera, mount, image in self._images(capture)
         }
-
-    def _detect(self, image: NDArray[np.uint8], camera: PinholeCamera, mount: Mount) -> Detections:
-        """Find the cars; a detector that can do so looks only where a car on the ground can be."""
-        if not isinstance(self.detector, BandDetector):
-            return self.detector.detect(image)
-        return self.detector.detect_on_ground(image, ground_band(camera, mount))
 
     def _disparities(self, capture: Capture) -> dict[str, tuple[StereoCamera, NDArray[np.float32]]]:
         return {

@@ -34,7 +34,7 @@ VIEW_REACH_M = 12.0  # m, up to which a slot without a car in the picture is hel
 _CANDIDATES = 8  # slots that a car may stand in
 _FREE_LOG_ODDS = 0.5  # against taken, from which a slot is known to be free
 _SHOWN_HEIGHT = 0.85  # fraction of a car's height that a picture must show
-_OCCLUDED = 0.15  # fraction of a slot's place in the picture from which a box hides it
+OCCLUDED = 0.15  # fraction of a slot's place in the picture from which a box hides it
 _LEAST_BEAMS, _BEAM_MAJORITY = 4, 0.6
 
 
@@ -147,7 +147,12 @@ class SlotFilter:
         self._add(near, change)
 
     def update_from_picture(
-        self, ground: GroundView, vehicle: FloatArray, boxes: FloatArray, errors: RangingErrors
+        self,
+        ground: GroundView,
+        vehicle: FloatArray,
+        boxes: FloatArray,
+        errors: RangingErrors,
+        occluded: float = OCCLUDED,
     ) -> None:
         """Update the slots where a picture would show a car, and the detector has found none.
 
@@ -161,6 +166,7 @@ class SlotFilter:
             vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
             boxes: (n, 4) px, all that the detector has found.
             errors: standard deviations of position and heading.
+            occluded: fraction of a slot's place in the picture from which a box hides it.
         """
         x, y, yaw = ground.mount.in_world(vehicle)
         near = self._slots_near(x, y, VIEW_REACH_M)
@@ -186,7 +192,7 @@ class SlotFilter:
         # A box with its lower edge above the ground at the slot's far end shows a car behind; a nearer slot's is lower.
         end = np.repeat(corners[:, :4, 1].min(axis=1)[:, None], len(others), axis=1)
         end[:, len(boxes) :] = high[:, 1, None] + 1.0
-        hidden = ((covered > _OCCLUDED) & (others[:, 3] >= end)).any(axis=1)
+        hidden = ((covered > occluded) & (others[:, 3] >= end)).any(axis=1)
         sights = [LineString([(x, y), self.lot.slot_xy[slot]]) for slot in near]
         hidden |= np.array([len(self._walls.query(s, predicate="intersects")) > 0 for s in sights], np.bool_)
         clear = (inside >= [1.0, _SHOWN_HEIGHT]).all(axis=1) & ~hidden
