@@ -186,7 +186,7 @@ def test_recall_and_precision_of_a_known_case():
     # 0.9 right, 0.8 a second box on the same car, 0.7 right, 0.1 nothing there.
     np.testing.assert_allclose(curve.recall, [1 / 3, 1 / 3, 2 / 3, 2 / 3])
     np.testing.assert_allclose(curve.precision, [1, 1 / 2, 2 / 3, 1 / 2])
-    assert curve.equal_error == pytest.approx(2 / 3)
+    assert min(curve.at_equal_error) == pytest.approx(2 / 3)
     assert curve.average_precision == pytest.approx(1 / 3 + 1 / 3 * 2 / 3)
 
 

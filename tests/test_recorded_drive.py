@@ -300,9 +300,7 @@ def test_orientations_of_any_near_norm_say_the_same_heading(norm):
         assert pose_of(SimpleNamespace(pose=at))[:3] == pytest.approx((1.0, 2.0, yaw))
         for factor in (0.0, 0.2, 9.0, math.nan):
             at.orientation.z, at.orientation.w = z * factor, w * factor
-            with pytest.raises(
-                InputError, match=r"its orientation has the norm .*, want a quaternion of norm 1"
-            ):
+            with pytest.raises(InputError, match=r"its orientation has the norm .*, want a quaternion"):
                 pose_of(SimpleNamespace(pose=at))
         at.orientation.z, at.orientation.w = z, w
 
@@ -330,10 +328,7 @@ def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_pa
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"poses": 0},
-            r"has no poses in /odom, want .*Odometry .*; it has /camera \(sensor_msgs/msg/Image\)",
-        ),
+        ({"poses": 0}, r"has no poses in /odom, want .*Odometry .*; it has /camera \(sensor_msgs"),
         ({"shift": {"/odom": 100.0}}, r"/camera ends at .* before /odom begins at .*: do their clocks"),
         ({"shift": {"/scan": -3.0}}, r"/scan ends at .* before /.* begins at .*; want streams that overlap"),
         ({"order": {"/odom": [0, 1, 3, 2, 4]}}, r"/odom: time goes from .* to .* s at message 4, want it"),

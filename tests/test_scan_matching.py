@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import parkenv
+from test_survey import halves
 
-from parkenv import InputError, OccupancyProcess, make_scenario
+from parkenv import InputError, Traffic, make_scenario
 from parkenv.mapping.odometry import PoseNoise, between, moved
 from parkenv.mapping.scan_matching import ScanMatcher
 from parkenv.mapping.survey import Survey, SurveySettings
@@ -107,26 +108,19 @@ def test_moving_cars_do_not_carry_the_pose_along(drive):
     assert position_error(located(lot, odometry, ahead), poses).max() < 0.4
 
 
-def full(name="mini"):
-    """Every other slot is always taken."""
-    lot = make_scenario(name).lot
-    taken = np.arange(lot.n_slots) % 2 == 0
-    world = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
-    return make_scenario(name, occupancy=world)
-
-
 def test_a_survey_knows_where_its_car_was():
     noise = PoseNoise(drift=0.05)
     settings = SurveySettings(
         every=6.0, weather="overcast", pose_noise=noise, localise="scan-matching", seed=3
     )
-    survey = Survey(full(), settings)
+    scenario, _ = halves(traffic=Traffic())
+    survey = Survey(scenario, settings)
     result = survey.drive(0)
     errors = [position_error(p, result.true_poses) for p in (result.odometry, result.poses)]
     assert errors[1].mean() < errors[0].mean()
     assert len(result.car_captures) == len(result.session.cars) > 0
     keys = {
-        Survey(full(), replace(settings, **change)).key_of(0)
+        Survey(scenario, replace(settings, **change)).key_of(0)
         for change in ({}, {"localise": "none"}, {"pose_noise": PoseNoise()})
     }
     assert len(keys) == 3

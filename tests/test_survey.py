@@ -23,12 +23,12 @@ from sim_sensors.rig import Mount, SensorRig
 BUSY = Traffic(cars=2, pedestrians=4)
 
 
-def halves(name="mini"):
+def halves(name="mini", traffic=BUSY):
     """Every other slot is always taken."""
     lot = make_scenario(name).lot
     taken = np.arange(lot.n_slots) % 2 == 0
     world = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
-    return make_scenario(name, occupancy=world, traffic=BUSY), taken
+    return make_scenario(name, occupancy=world, traffic=traffic), taken
 
 
 def test_who_watches_a_session_changes_nothing_and_sees_the_truth():

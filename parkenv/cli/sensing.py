@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from pydantic import AfterValidator, Field
 from pydantic.fields import FieldInfo
@@ -89,8 +89,9 @@ class MapDrive(Command):
 
     def run(self) -> None:
         from parkenv.mapping.recordings.calibration import DriveCalibration
+        from parkenv.perception.detector_registry import make_detector
         from parkenv.scenarios.build import build
-        from parkenv.studies.sensing.recorded_session import add_recording
+        from parkenv.studies.sensing.recorded_session import DriveReader, add_recording
         from parkenv.studies.sensing.street_discovery import discover_recordings
 
         require(
@@ -99,22 +100,21 @@ class MapDrive(Command):
         require(self.discover or self.streets is None, "--streets is of --discover")
         require(self.discover or len(self.recordings) == 1, "several recordings are of --discover, want one")
         scenario = None if self.scenario is None else build(self.scenario)
-        calibration = None if self.calibration is None else DriveCalibration.read(self.calibration)
         console = make_console()
         with stages(console, "captures") as progress:
-            given: dict[str, Any] = {
-                "calibration": calibration,
-                "detector": self.detector or (scenario.detector if scenario else "hog"),
-                "every": self.every,
-                "localise": self.localise,
-                "photos": self.photos,
-                "progress": progress,
-            }
+            reader = DriveReader(
+                make_detector(self.detector or (scenario.detector if scenario else "hog")),
+                None if self.calibration is None else DriveCalibration.read(self.calibration),
+                self.every,
+                self.localise,
+                self.photos,
+                progress,
+            )
             if self.discover:
-                rows = discover_recordings(self.recordings, self.out, streets=self.streets, **given)
+                rows = discover_recordings(self.recordings, self.out, reader, streets=self.streets)
             else:
                 lot_file = self.scenario.lot.file if self.scenario else None
-                rows = [add_recording(self.recordings[0], scenario, self.out, lot_file=lot_file, **given)]
+                rows = [add_recording(self.recordings[0], scenario, self.out, reader, lot_file=lot_file)]
         save_summary(self.out, None, rows)
         for row in rows:
             print_table(console, table_of("", "The drive", [row], COLUMNS, facts=True))

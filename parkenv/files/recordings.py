@@ -36,9 +36,7 @@ MAX_MERGED_BYTES = 1_000_000_000
 """Maximum size, unpacked, of chunks that overlap in time, which are read at the same time."""
 MAX_GROWTH = 100
 """Maximum size of a packed file of a rosbag, unpacked, as a multiple of its own size, beside 1 MB."""
-_NO_PICTURE = re.compile(
-    r"(?i)16|32|64|mono16|bayer|h26|hevc|av1|vp9"
-)  # depth, a mosaic of colours, or a film
+_NO_PICTURE = re.compile(r"(?i)16|32|64|mono16|bayer|h26|hevc|av1|vp9")  # depth, colour mosaics, films
 _OTHER_PICTURES = re.compile(r"(?i)image|video|packet")  # in names of types of other transports of pictures
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"

@@ -35,9 +35,8 @@ free_thresh: 0.196
 def write_grid(grid: OccupancyGrid, folder: Path) -> None:
     """Write map.png and map.yaml; the picture's lower left corner is at the origin, y is upwards."""
     p = grid.probability
-    cells = np.where(p > _IS_OCCUPIED, OCCUPIED, np.where(grid.seen & (p < 0.5), FREE, UNKNOWN)).astype(
-        np.uint8
-    )
+    free = np.where(grid.seen & (p < 0.5), FREE, UNKNOWN)
+    cells = np.where(p > _IS_OCCUPIED, OCCUPIED, free).astype(np.uint8)
     with atomic_write(folder / "map.png") as beside:
         beside.write_bytes(cv2.imencode(".png", cells[::-1])[1].tobytes())
     x, y = grid.low

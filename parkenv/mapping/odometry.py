@@ -53,11 +53,10 @@ class PoseNoise:
 
 
 def between(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return how the car moved from one pose to another, in the frame of the first: forward, left, m, and turn, rad."""
-    x, y = end[:2] - start[:2]
+    """Return other poses, (..., 3), in the frame of one, (3,): forward, left, m, and turn, rad."""
     c, s = math.cos(start[2]), math.sin(start[2])
-    turn = (end[2] - start[2] + math.pi) % (2.0 * math.pi) - math.pi
-    return np.array([c * x + s * y, c * y - s * x, turn])
+    x, y, turn = np.moveaxis(end - start, -1, 0)
+    return np.stack([c * x + s * y, c * y - s * x, (turn + math.pi) % (2.0 * math.pi) - math.pi], axis=-1)
 
 
 def moved(start: FloatArray, motion: FloatArray) -> FloatArray:
@@ -70,9 +69,7 @@ def moved(start: FloatArray, motion: FloatArray) -> FloatArray:
 def _drifting(poses: FloatArray, drift: float, rng: np.random.Generator) -> FloatArray:
     part = drift / math.sqrt(3.0)
     scale = 1.0 + part * rng.normal()
-    bend = (
-        2.0 * part / DRIFT_M * rng.normal()
-    )  # rad/m: half of it times the square of the distance is the error
+    bend = 2.0 * part / DRIFT_M * rng.normal()  # rad/m; times half the squared distance it is the error
     wander = drift / math.sqrt(DRIFT_M) * rng.normal(size=len(poses))  # rad per square root of a metre
     out = np.array(poses, dtype=np.float64)
     for i in range(1, len(poses)):

@@ -36,10 +36,7 @@ from parkenv.world.lot import Mouth, ParkingLot
 
 REACH = 25.0  # m, farthest points used
 LEAST_POINTS = 20  # of a scan that is matched
-SCAN_CELL, SUBMAP_CELL = (
-    0.25,
-    0.1,
-)  # m; one point of each cell stays, of a fitted scan and of the points so far
+SCAN_CELL, SUBMAP_CELL = 0.25, 0.1  # m; one point of each stays, of a scan and of the points so far
 SUBMAP_CAPTURES = 30  # captures whose points a scan is fitted to
 NEIGHBORS = 5  # points that make a line
 POINT_GATE = 0.5  # m, farthest point of a line

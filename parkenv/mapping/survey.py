@@ -175,9 +175,7 @@ class Survey:
         session, score = SessionMap(self.pipeline, lot, self.settings.localise), SurveyScore(lot.n_slots)
         observed_at, poses = np.full(lot.n_slots, drive.arrival.time), np.empty_like(drive.odometry)
         views, frame_s = [], []
-        shown: dict[
-            int, PerceptionResult
-        ] = {}  # for each section of the route, the capture with the most cars
+        shown: dict[int, PerceptionResult] = {}  # of each section of the route, that with the most cars
         for i, time in enumerate(drive.times.tolist()):
             scene, capture = drive.capture(i)
             session.slots.updated[:] = False

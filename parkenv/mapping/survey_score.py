@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.mapping.distance_bins import DISTANCE_ENDS
 from parkenv.perception.pipeline import CameraView, PerceptionResult
 from parkenv.perception.ranging import LocatedCars
 from sim_sensors.ground_truth import VehicleBoxes, vehicle_boxes
@@ -19,6 +18,8 @@ from sim_sensors.scene import Scene
 
 MATCH = 0.3  # intersection over union from which a detection matches a car
 CLEAR = 0.6  # visible fraction of a car in an image from which a frame without its detection counts as a miss
+DISTANCE_ENDS = (4.0, 6.0, 8.0, 10.0, 12.0, 15.0)
+"""m, from the camera to a car's centre: upper ends of the bins in which detections are counted."""
 METHODS = ("fitted", "thesis")
 """Localisation methods: `localize_cars`, and the median range as in the thesis (`localize_as_thesis`)."""
 _GLIMPSE = 0.05  # visible fraction from which a box can match a car

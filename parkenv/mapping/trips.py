@@ -60,9 +60,7 @@ class Trip:
 class SlotStates:
     slots: NDArray[np.int64]  # (k,) in the order of their first observations
     time: FloatArray  # (k,) of the first observation, on the clock of `Trip.time`
-    likelihood: (
-        FloatArray  # (k, 2) probability of all observations if the slot was free then, and if it was taken
-    )
+    likelihood: FloatArray  # (k, 2) of all observations, if the slot was free then, and if it was taken
 
 
 def state_likelihoods(trip: Trip, forecast: Forecast) -> SlotStates:

@@ -59,9 +59,7 @@ def fit_box(
     extent = high - low
     sight = np.abs(0.5 * (low + high) - seen_from)
     along = int((extent if extent.max() > LONG_SIDE else sight if end_on else -sight).argmax())
-    size = np.full(2, CAR_WIDTH)
-    size[along] = CAR_LENGTH
-    size = np.maximum(size, extent)
+    size = np.maximum(np.where(np.arange(2) == along, CAR_LENGTH, CAR_WIDTH), extent)
     anchor = np.zeros(2)  # -1: the low side is a true side of the car, 1: the high side, 0: undecided
     for i in (0, 1):
         anchor[i] = -1.0 if seen_from[i] < low[i] else 1.0 if seen_from[i] > high[i] else 0.0
@@ -73,15 +71,8 @@ def fit_box(
     middle = 0.5 * (low + high) + anchor * 0.5 * (extent - size)
     x, y = axis.T @ middle
     yaw = (theta + (math.pi / 2 if along == 1 else 0.0)) % math.pi
-    return FittedCar(
-        float(x),
-        float(y),
-        yaw,
-        float(size[along]),
-        float(size[1 - along]),
-        float(extent[along]),
-        float(extent[1 - along]),
-    )
+    sides = np.stack([size, extent])[:, [along, 1 - along]]
+    return FittedCar(float(x), float(y), yaw, *sides.ravel().tolist())
 
 
 def direction_of(points: FloatArray) -> float:

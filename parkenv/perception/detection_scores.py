@@ -41,17 +41,13 @@ class RecallPrecision:
     precision: FloatArray  # (k,) float64, fraction of the detections that are cars
 
     @property
-    def equal_error(self) -> float:
-        """Equal-error rate: the largest value that recall and precision both reach at one threshold."""
-        return min(self.at_equal_error)
-
-    @property
     def average_precision(self) -> float:
         best = np.maximum.accumulate(self.precision[::-1])[::-1]
         return float(np.sum(np.diff(self.recall, prepend=0.0) * best))
 
     @property
     def at_equal_error(self) -> tuple[float, float]:
+        """Recall and precision at the threshold where the lower of them, the equal-error rate, is largest."""
         if not len(self.recall):
             return 0.0, 0.0
         i = int(np.minimum(self.recall, self.precision).argmax())
@@ -142,7 +138,7 @@ def score_on(
         "test_set": test_set,
         "images": len(images),
         "cars": sum(len(i.boxes) for i in images),
-        "eer": curve.equal_error,
+        "eer": min(recall, precision),
         "average_precision": curve.average_precision,
         "recall": recall,
         "precision": precision,

@@ -22,9 +22,7 @@ from parkenv.perception.detector import Detections, DetectorErrors, GroundBand
 from parkenv.perception.hog import CELL, Descriptor, correlate
 
 END_BELOW = 1.8  # width over height of a box below which it shows a front or rear
-END_WIDEST = (
-    2.0  # width over height of a box above which no long lens shows a car's whole front or rear in it
-)
+END_WIDEST = 2.0  # width over height of a box that is too wide for the whole front or rear of a car
 LEAST_SCORED = 0.002
 """Least probability of a detection that counts in an evaluation: curves go on to many false positives."""
 _ZOOM = 1.6
@@ -124,13 +122,11 @@ class HogDetector:
         Raises:
             InputError: an image of another shape or dtype.
         """
-        return self._best(as_grey(image), None)
+        return self.detect_on_ground(image, None)
 
-    def detect_on_ground(self, image: Image, band: GroundBand) -> Detections:
+    def detect_on_ground(self, image: Image, band: GroundBand | None) -> Detections:
         """Find the cars whose boxes lie in a band; the rows of the image that cannot have one are not looked at."""
-        return self._best(as_grey(image), band)
-
-    def _best(self, grey: Image, band: GroundBand | None) -> Detections:
+        grey = as_grey(image)
         of_each = in_threads(lambda model: self.scan(model, grey, band), self.models)
         all_models = Detections(
             *(

@@ -69,12 +69,8 @@ _LENGTH_STD = 0.3  # m, standard deviation of how far a car's centre is behind i
 _MIDDLE = 0.05  # standard deviation between the middles of box and car, as a fraction of the box's width
 _UNKNOWN = 1e6  # m², variance of a measurement that the picture's border prevents
 _AGREE = 3.0  # standard deviations up to which measurements agree
-STREET_PITCH = math.radians(
-    0.7
-)  # of a camera against the ground at the kerb: a cross fall of 2.5 % 10 m away is 0.6
-_COMMON_PITCH = math.radians(
-    0.2
-)  # by how much the usual height and all boxes of a drive may be wrong together
+STREET_PITCH = math.radians(0.7)  # of a camera against the kerb; a cross fall of 2.5 % is 0.6 at 10 m
+_COMMON_PITCH = math.radians(0.2)  # that the usual height and all boxes of a drive may be wrong by
 _SURE, _LEVEL_REACH = 0.5, 25.0  # probability and distance, m, of the cars that tell the pitch
 _OF_ONE_CAR = 0.2  # weight of a box: those of one car, about five, err alike
 _HIDDEN = 0.5  # fraction of a box's lower edge that nearer boxes cover, from which it is not the car's own

@@ -53,7 +53,7 @@ class LocatedCars:
     covariance: FloatArray | None = None  # (n, 2, 2) float64, m², of the centres
     points: tuple[
         FloatArray, ...
-    ] = ()  # of cars that a sensor has measured: (k, 2) m, the end points of their beams
+    ] = ()  # (k, 2) m, end points of the beams, of cars that a sensor has measured
 
     def __post_init__(self) -> None:
         n = len(self.yaw)
@@ -213,11 +213,9 @@ def localize_cars(
 
 def _whole(ends: FloatArray, run: FloatArray) -> FloatArray:
     """Return the end points of a run, if they are no more than a car: its box is too small; else those in the box."""
-    if len(run) > len(ends):
-        yaw = direction_of(run)
-        sides = np.sort([np.ptp(run @ [math.cos(a), math.sin(a)]) for a in (yaw, yaw + 0.5 * math.pi)])
-        return run if sides[1] <= LONGEST and sides[0] <= WIDEST else ends
-    return ends
+    yaw = direction_of(run)
+    sides = np.sort([np.ptp(run @ [math.cos(a), math.sin(a)]) for a in (yaw, yaw + 0.5 * math.pi)])
+    return run if sides[1] <= LONGEST and sides[0] <= WIDEST else ends
 
 
 def localize_median(

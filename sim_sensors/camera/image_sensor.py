@@ -18,9 +18,7 @@ from sim_sensors.errors import SensorError, require_numbers
 
 _CURVE_STEPS = 4096
 _BRIGHTEST = np.float32(4.0)  # greatest input of the tone curve; a plain sRGB curve would clip at 1
-_STEPS_PER_ROOT = np.float32(
-    (_CURVE_STEPS - 1) / math.sqrt(4.0)
-)  # of the tone curve, per square root of light
+_STEPS_PER_ROOT = np.float32((_CURVE_STEPS - 1) / math.sqrt(4.0))  # per square root of light
 _KNEE = 0.7  # highlights above this are compressed, as in a camera's own curve
 _NOISE = 1 << 20  # numbers in the noise table
 

@@ -32,9 +32,7 @@ class Form:
     rear_bow: float
     tumblehome: float  # inward lean of the side windows
     crown: float  # height of the middle of the roof above its edges
-    roof_drop: tuple[
-        float, float
-    ]  # of the roof's edge from its highest point to the header and to its rear end
+    roof_drop: tuple[float, float]  # of the roof's edge, from its top to the header and to its rear end
     nose_depth: float  # length of the rounding of the plan at either end
     tail_depth: float
     nose_power: float  # exponents of that rounding (superellipse); 2 is round, 4 boxy

@@ -16,10 +16,7 @@ BAND_M = 0.3, 0.8  # m above the road, of the returns that make a scan
 BAND_MIDDLE_M = 0.55
 SCANNER = LaserScanner(900, -math.pi, math.radians(0.4), 40.0)
 _MIN_RANGE_M = 0.5
-_OVER_M, _HIGHEST_M = (
-    1.0,
-    2.0,
-)  # m; what is met so much nearer, and up to this high, hides what is in the band
+_OVER_M, _HIGHEST_M = 1.0, 2.0  # what is so much nearer, and no higher, hides what is in the band
 _TOP_M = 4.0  # what is higher hangs over the road
 _TOP_DEPTH_M = 0.3, 1.2  # before and behind the range of a beam, of what may be the same obstacle
 _ROAD_M = 2.5, 15.0, 3.0  # ahead or behind from, to, and aside: where the road is that the plane is fitted to

@@ -207,13 +207,6 @@ class PoseTrack:
         return np.array([np.interp((stamp - self.stamps[0]) / 1e9, at, tilt) for tilt in self._tilts.T])
 
 
-def within(pose: FloatArray, other: FloatArray) -> FloatArray:
-    """Return one pose, (..., 3), in the frame of another, (3,)."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    x, y, yaw = np.moveaxis(other - pose, -1, 0)
-    return np.stack([c * x + s * y, c * y - s * x, (yaw + math.pi) % (2.0 * math.pi) - math.pi], axis=-1)
-
-
 def placed(pose: FloatArray, other: FloatArray) -> FloatArray:
     """Return in the world what is at `other` in the frame of `pose`; both are (..., 3) x, y, yaw."""
     (x, y, yaw), (ahead, left, turn) = np.moveaxis(pose, -1, 0), np.moveaxis(other, -1, 0)

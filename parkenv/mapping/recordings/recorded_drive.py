@@ -25,6 +25,7 @@ from parkenv.errors import InputError, naming
 from parkenv.files.limited_reading import parse_json
 from parkenv.files.recordings import TRANSFORMS, Messages, open_recording, picture_in, stamp_of
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.mapping.odometry import between
 from parkenv.mapping.recordings.calibration import DriveCalibration
 from parkenv.mapping.recordings.laser_scans import Scan, common_scanner, mirrored, scan_of, without_motion
 from parkenv.mapping.recordings.point_clouds import (
@@ -35,7 +36,7 @@ from parkenv.mapping.recordings.point_clouds import (
     points_of,
     scan_of_cloud,
 )
-from parkenv.mapping.recordings.poses import PoseReader, PoseTrack, placed, within
+from parkenv.mapping.recordings.poses import PoseReader, PoseTrack, placed
 from parkenv.mapping.recordings.setup import set_up, set_up_survey
 from parkenv.mapping.recordings.sources import Source
 from parkenv.mapping.recordings.writer import HEAD, RECORDED_MONDAY_S, Head
@@ -178,7 +179,7 @@ class RecordedDrive:
         vehicle = self._track.at(stamp + np.rint(np.r_[0.0, late] * 1e9).astype(np.int64))
         mount = self._setup.lasers[name].mount
         sensor = placed(vehicle, np.array([mount.x, mount.y, mount.yaw]))
-        moved = within(sensor[0], sensor[1:])
+        moved = between(sensor[0], sensor[1:])
         is_still = np.hypot(*moved.T[:2]).max() < _STILL[0] and np.abs(moved[:, 2]).max() < _STILL[1]
         return scan if is_still or np.isnan(moved).any() else without_motion(scan, moved)
 
@@ -237,9 +238,7 @@ class RecordedDrive:
         """What joins the pictures of the first camera."""
         first = self._stamps[next(key for key in self._stamps if key.startswith("image:"))]
         found = _Matched(first, self._track.at(first), np.ones(len(first), np.bool_), {}, {})
-        for key in sorted(
-            self._stamps.keys() - {"pose", "imu"}
-        ):  # the left camera of a pair before the right one
+        for key in sorted(self._stamps.keys() - {"pose", "imu"}):  # of a pair, the left camera first
             beside, most = first, LASER_S if key.startswith("scan:") else CAMERAS_S
             if key.startswith("image:") and key.endswith(":right"):
                 left = f"{key[:-5]}left"
@@ -286,7 +285,7 @@ class RecordedDrive:
             key = f"scan:{name}"
             index = self._matched.partners[key][k]
             then = self._stamps[key][index]
-            where = within(pose, self._track.at(then[None])[0])
+            where = between(pose, self._track.at(then[None])[0])
             if then != stamp and not np.isnan(where).any():
                 moved[name] = where
             if name not in self._setup.clouds:

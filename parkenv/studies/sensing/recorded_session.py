@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,17 @@ from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.map_files import week_time, write_grid, write_slots
 from parkenv.mapping.recordings.calibration import DriveCalibration
 from parkenv.mapping.recordings.folders import source_of
-from parkenv.mapping.recordings.located_drive import CAR_COLUMNS, MappedDrive, locate_cars, map_drive
+from parkenv.mapping.recordings.located_drive import (
+    CAR_COLUMNS,
+    LocatedDrive,
+    MappedDrive,
+    locate_cars,
+    map_drive,
+)
 from parkenv.mapping.recordings.photo_options import PhotoOptions
 from parkenv.mapping.recordings.recorded_drive import RecordedDrive
 from parkenv.mapping.store import MapStore
-from parkenv.perception.detector_registry import make_detector
+from parkenv.perception.detector import Detector
 from parkenv.scenarios.build import make_scenario
 from parkenv.show.figures.survey import save_map
 from parkenv.studies.results import Row
@@ -39,40 +46,64 @@ SIGHTING_COLUMNS = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class DriveReader:
+    """How recordings are read, and the cars in them located.
+
+    Without a `calibration`, a recording has sensors, mounts and topics. Captures are at least `every` m apart. What
+    corrects the recorded poses is `none`, or `scan-matching`, for which they are drifting odometry. `photos` says of
+    photographs or a film where the poses are, and what the camera is.
+    """
+
+    detector: Detector
+    calibration: DriveCalibration | None = None
+    every: float = 0.0
+    localise: LocaliserName = "none"
+    photos: PhotoOptions = field(default_factory=PhotoOptions)
+    progress: Progress = lambda *_: None
+
+    def read(self, recording: Path, frame: LocalFrame | None) -> RecordedDrive:
+        """Read what `source_of` can; the frame says where poses in degrees are, None: around them."""
+        self.progress("Reading", 0, 0)
+        if self.photos.origin is not None:
+            frame = LocalFrame(self.photos.origin[1], self.photos.origin[0])
+        source = source_of(recording, self.calibration, self.photos, frame)
+        drive = RecordedDrive(recording, self.calibration, source, frame)
+        if self.localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
+            wanted = f"want none: {recording} has no laser nor stereo camera"
+            raise InputError(f"localise is {self.localise!r}, {wanted}")
+        return drive
+
+    def locate(self, drive: RecordedDrive, lot: ParkingLot | None = None) -> LocatedDrive:
+        on_frame = counted(self.progress, "Locating cars")
+        return locate_cars(
+            drive, self.detector, lot, every=self.every, localise=self.localise, on_frame=on_frame
+        )
+
+
 def add_recording(
     recording: Path,
     scenario: Scenario | None,
     folder: Path,
+    reader: DriveReader,
     *,
-    calibration: DriveCalibration | None = None,
-    detector: str = "hog",
-    every: float = 0.0,
-    localise: LocaliserName = "none",
-    photos: PhotoOptions | None = None,
     lot_file: Path | None = None,
-    progress: Progress = lambda *_: None,
 ) -> Row:
     """Add a recorded drive to the map in a folder, and write its tables, pictures and files for other programs.
 
-    `recording` is what `source_of` reads; `photos` says of photographs or a film where the poses are, and what the
-    camera is. Without a `calibration` the recording has sensors, mounts and topics. Captures are at least `every` m
-    apart. A lot file in degrees says where poses in degrees are. Without a scenario, the drive is one of `parkenv
-    survey`, which names its own. Return what was found: captures, slots seen and taken, cars, and the errors and
-    largest correction of poses, m.
+    A lot file in degrees says where poses in degrees are. Without a scenario, the drive is one of `parkenv survey`,
+    which names its own. Return what was found: captures, slots seen and taken, cars, and the errors and largest
+    correction of poses, m.
     """
-    finder = make_detector(detector)
-    progress("Reading", 0, 0)
     is_geographic = lot_file is not None and lot_format(lot_file) == "native"
     frame = read_contents(lot_file).frame if lot_file is not None and is_geographic else None
-    drive = read_drive(recording, calibration, photos, frame, localise)
+    drive = reader.read(recording, frame)
     scenario = scenario or _scenario_of(drive)
     drive.require_near(scenario.lot)
     make_folder(folder)
     with MapStore(folder / MAP_FILE, scenario.lot) as store:
         require(not store.has(drive.key), f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
-        on_frame = counted(progress, "Locating cars")
-        located = locate_cars(drive, finder, scenario.lot, every=every, localise=localise, on_frame=on_frame)
-        found = map_drive(located, scenario.lot)
+        found = map_drive(reader.locate(drive, scenario.lot), scenario.lot)
         store.add(found.session)
         log = store.log()
     title = f"{scenario.name}, {week_time(found.session.time)}"
@@ -98,27 +129,6 @@ def write_drives(
     for one in drives[:-1]:
         grid.merge(one.grid)
     write_grid(grid, folder)
-
-
-def read_drive(
-    recording: Path,
-    calibration: DriveCalibration | None,
-    photos: PhotoOptions | None,
-    frame: LocalFrame | None,
-    localise: LocaliserName,
-) -> RecordedDrive:
-    """Read a recording, or photographs with poses; the frame says where poses in degrees are, None: around them.
-
-    What corrects the recorded poses is `none`, or `scan-matching`, for which they are drifting odometry.
-    """
-    photos = photos or PhotoOptions()
-    if photos.origin is not None:
-        frame = LocalFrame(photos.origin[1], photos.origin[0])
-    source = source_of(recording, calibration, photos, frame)
-    drive = RecordedDrive(recording, calibration, source, frame)
-    if localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
-        raise InputError(f"localise is {localise!r}, want none: {recording} has no laser nor stereo camera")
-    return drive
 
 
 def _scenario_of(drive: RecordedDrive) -> Scenario:

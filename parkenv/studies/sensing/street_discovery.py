@@ -14,7 +14,6 @@ from pydantic import Field
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, require
 from parkenv.files.atomic_write import make_folder, write_together
-from parkenv.files.known_names import LocaliserName
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec
 from parkenv.lots.draft import Provenance
@@ -23,18 +22,14 @@ from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import read_lot
 from parkenv.mapping.car_tracks import ParkedCars
-from parkenv.mapping.recordings.calibration import DriveCalibration
-from parkenv.mapping.recordings.located_drive import LocatedDrive, MappedDrive, locate_cars, map_drive
-from parkenv.mapping.recordings.photo_options import PhotoOptions
+from parkenv.mapping.recordings.located_drive import LocatedDrive, MappedDrive, map_drive
 from parkenv.mapping.store import MapStore, Session
 from parkenv.mapping.street_lanes import driven_lanes, mapped_lanes, street_lot
 from parkenv.mapping.street_slots import CAR, GAP, LONE_CAR, ONCE, StreetSlots, discover_street
-from parkenv.perception.detector_registry import make_detector
 from parkenv.perception.slot_filter import SlotFilter
 from parkenv.studies.results import Row
-from parkenv.studies.sensing.recorded_session import drive_row, read_drive, write_drives
+from parkenv.studies.sensing.recorded_session import DriveReader, drive_row, write_drives
 from parkenv.studies.sensing.sessions import MAP_FILE
-from parkenv.studies.study import Progress, counted
 from parkenv.world.lot import Lane, ParkingLot
 
 LOT_FILE = "lot.geojson"
@@ -63,32 +58,23 @@ class _Drives(Spec):
 def discover_recordings(
     recordings: Sequence[Path],
     folder: Path,
+    reader: DriveReader,
     *,
-    calibration: DriveCalibration | None = None,
-    detector: str = "hog",
-    every: float = 0.0,
-    localise: LocaliserName = "none",
-    photos: PhotoOptions | None = None,
     streets: Path | None = None,
-    progress: Progress = lambda *_: None,
 ) -> list[Row]:
     """Make a lot and its map from drives past an unknown street, and from those that are in the folder already.
 
-    The arguments are those of `add_recording`; the lanes are those of the map `streets`, else the driven track. Return
-    what each drive has found.
+    The lanes are those of the map `streets`, else the driven track. Return what each drive has found.
     """
-    finder = make_detector(detector)
-    progress("Reading", 0, 0)
     earlier = _read_earlier(folder) if (folder / LOT_FILE).exists() else _Earlier()
     frame = earlier.frame
     drives: list[LocatedDrive] = []
     for recording in recordings:
-        drive = read_drive(recording, calibration, photos, frame, localise)
+        drive = reader.read(recording, frame)
         frame = frame or drive.frame
         known = {one.drive.key for one in drives} | {one.key for one in earlier.sessions}
         require(drive.key not in known, f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
-        on_frame = counted(progress, "Locating cars")
-        drives.append(locate_cars(drive, finder, every=every, localise=localise, on_frame=on_frame))
+        drives.append(reader.locate(drive))
     tracks = [*earlier.tracks, *(one.track for one in drives)]
     if streets is not None and frame is None:
         raise InputError(f"{streets}: is in degrees, and the poses are in metres; want poses in degrees")

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.files.file_names import file_name
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
-from parkenv.mapping.distance_bins import DISTANCE_ENDS
 from parkenv.mapping.inference import Prediction, SessionLog, predict
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, SurveySettings
-from parkenv.mapping.survey_score import METHODS
+from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
 from parkenv.show.plurals import plural
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, MAP_FILE, SESSION_COLUMNS
