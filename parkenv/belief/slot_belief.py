@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.belief.cue_belief import freed
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
@@ -60,6 +61,8 @@ class SlotBelief:
             the level and of the slope to the goal; see `parkenv.world.occupancy.day_error`.
         step_observed: (4 * k,) float, what the last step observed, four consecutive parts: slot, or -1; whether it was
             observed taken; hit rate; false-alarm rate. See `observations`.
+        cues: (2 * n_slots,) float, or empty without cues, two parts: the excess that each slot's last observation left,
+            and 1/s, the rate at which a car that is about to leave leaves; see `cue_belief`.
 
     Examples:
         Slot 1 is observed free and stays likely to be free for a while.
@@ -75,6 +78,7 @@ class SlotBelief:
     time: float
     day_error: NDArray[np.floating] = field(default_factory=lambda: _SURE)
     step_observed: NDArray[np.floating] = field(default_factory=lambda: _NOTHING)
+    cues: NDArray[np.floating] = field(default_factory=lambda: _NOTHING)
 
     @classmethod
     def of_observation(cls, observation: Mapping[str, Any]) -> Self:
@@ -90,6 +94,7 @@ class SlotBelief:
                 float(observation["time"][1]),
                 observation["day_error"],
                 observation["step_observed"],
+                observation.get("cues", _NOTHING),
             )
         except KeyError as error:
             raise InputError(
@@ -103,6 +108,7 @@ class SlotBelief:
             "belief": self.parts.astype(np.float32),
             "step_observed": self.step_observed.astype(np.float32),
             "day_error": self.day_error.astype(np.float32),
+            **({"cues": self.cues.astype(np.float32)} if len(self.cues) else {}),
         }
 
     @classmethod
@@ -187,9 +193,10 @@ class SlotBelief:
         """Return the belief of some of the slots, (k,), in float64."""
         parts = self._rows[:, slots].astype(np.float64)
         p_occupied = self.p_occupied[slots].astype(np.float64)
+        cues = self.cues.reshape(2, -1)[:, slots if len(self.cues) else []].astype(np.float64)
         observed = slot, _, *rest = self.observations.take(slots)
         taken = type(self)(
-            p_occupied, parts.ravel(), self.time, self.day_error, np.concatenate([slot, *rest])
+            p_occupied, parts.ravel(), self.time, self.day_error, np.concatenate([slot, *rest]), cues.ravel()
         )
         taken.observations = observed
         return taken
@@ -218,7 +225,9 @@ class SlotBelief:
         before = before[:, : np.count_nonzero(before[0] >= 0.0)].astype(np.float64)
         step_observed = np.hstack([before, [observed, reports, hits, false_alarms]]).ravel()
         p_occupied, parts = self.p_occupied.astype(np.float64), self.parts.astype(np.float64)
-        later = type(self)(p_occupied, parts, self.time, self.day_error, step_observed)
+        cues = self.cues.astype(np.float64)
+        cues[observed if len(cues) else []] = 0.0
+        later = type(self)(p_occupied, parts, self.time, self.day_error, step_observed, cues)
         _update_slots(later.p_occupied, observed, reports, hits, false_alarms)
         later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time
         return later
@@ -236,9 +245,15 @@ class SlotBelief:
     def decay(self, seconds: float) -> Self:
         """Return the belief after some time without observations."""
         later = type(self)(
-            self.p_occupied, self.parts.astype(np.float64), self.time + seconds, self.day_error
+            self.p_occupied,
+            self.parts.astype(np.float64),
+            self.time + seconds,
+            self.day_error,
+            cues=self.cues,
         )
-        later.p_occupied = _decay_slots(later.forecast, later.decay_rate, later.p_observed, later.age)
+        later.p_occupied = _decay_slots(
+            later.forecast, later.decay_rate, later.p_observed, later.age, self.cues
+        )
         return later
 
 
@@ -343,10 +358,17 @@ def _update_slots(
 
 @compiled
 def _decay_slots(
-    forecast: FloatArray, decay_rate: FloatArray, p_observed: FloatArray, age: FloatArray
+    forecast: FloatArray,
+    decay_rate: FloatArray,
+    p_observed: FloatArray,
+    age: FloatArray,
+    cues: NDArray[np.floating],
 ) -> FloatArray:
-    p_occupied = forecast.copy()
-    for s in range(len(forecast)):
+    p_occupied, n = forecast.copy(), len(forecast)
+    for s in range(n):
         if age[s] < np.inf:
             p_occupied[s] = decay_to_prior(forecast[s], decay_rate[s], p_observed[s], age[s])
+            if len(cues) and cues[s] != 0.0:
+                freed_by_now = freed(cues[s], cues[n + s], decay_rate[s], age[s])
+                p_occupied[s] = min(max(p_occupied[s] - freed_by_now, 0.0), 1.0)
     return p_occupied

@@ -122,7 +122,8 @@ class BeliefObserver(Observer):
 
     def __init__(self, tables: ScenarioRecords, n: int, without: tuple[str, ...] = ()) -> None:
         space = {k: v for k, v in space_of(tables.scenarios).items() if k not in without}
-        kept = tuple(name for name in ("p_occupied", "belief", "step_observed", "day_error") if name in space)
+        names = ("p_occupied", "belief", "step_observed", "day_error", "cues")
+        kept = tuple(name for name in names if name in space)
         super().__init__(tables, n, spaces.Dict(space), full_belief=True, kept=kept)
 
     def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:

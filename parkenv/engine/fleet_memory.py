@@ -250,6 +250,9 @@ class FleetMemory:
             "day_error": day_error(),
             "action_mask": self._mask(car, vertex),
         }
+        searches, row = self._rows[address]
+        if len(searches.cues):
+            observation["cues"] = searches.cues[row].reshape(-1).copy()
         if self._is_guided:
             reserved = self.search_of(address)["reserved"]
             own = np.arange(len(self.slots)) == reserved

@@ -14,13 +14,18 @@ import numpy as np
 from numba.cpython.unsafe.tuple import tuple_setitem
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
+from parkenv.belief.cue_belief import freed
+from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
+    CUE_STREAM,
     ENTRY_STREAM,
+    LEAD_STREAM,
     OBSERVATION_STREAM,
     SCENARIO_STREAM,
     VIEW_STREAM,
     episode_key,
+    keyed_exponential,
     keyed_uniform,
 )
 from parkenv.compiled.memory import float32s, float64s, int32s, int64s
@@ -37,6 +42,7 @@ from parkenv.engine.records import (
     UNGUIDED,
     block_at,
     counted_at,
+    cue_at,
     edge_at,
     scenario_at,
     search_at,
@@ -47,10 +53,12 @@ from parkenv.engine.search_belief import (
     apply_observation,
     belief_now,
     column_of,
+    end_of_stay,
     forecast_of,
     init_full_prior,
     is_forbidden,
     is_taken,
+    leaving_rate,
     observe_attempt,
     observe_changed,
     parking_cost_s,
@@ -96,6 +104,7 @@ def read_step(scenario_index: int, result: tuple[Any, ...]) -> tuple[float, bool
 
 
 _LOGISTIC = 1.702  # the logistic law of z times this is closest to the normal one
+_LEAST_P = 1e-6
 _SURE = 8.0  # standard deviations beyond which a facility is surely full, or not
 _ABOVE = 1e-3  # how far above its forecast a facility is at least whose count says that it is full
 SCENARIO_BYTES = SCENARIO.itemsize
@@ -433,14 +442,14 @@ def observe(search: Any) -> None:
 
 @kernel
 def observe_otherwise(search: Any) -> None:
-    if scenario_at(search.scenario, 0).n_live == 0:
-        observe_noisy(search)
-        return
     if scenario_at(search.scenario, 0).no_errors:
         observe_exact(search)
     else:
         observe_noisy(search)
-    observe_live(search)
+    if scenario_at(search.scenario, 0).n_live > 0:
+        observe_live(search)
+    if scenario_at(search.scenario, 0).lead_s > 0.0:
+        observe_cues(search)
 
 
 @inlined
@@ -495,6 +504,67 @@ def observe_noisy(search: Any) -> None:
         rate = hit_rate[i] if is_taken(search, column, time) else false_alarm_rate[i]
         taken = keyed_uniform(key, OBSERVATION_STREAM, slot, millisecond) < rate
         apply_observation(search, column, taken, hit_rate[i], false_alarm_rate[i])
+
+
+@kernel
+def observe_cues(search: Any) -> None:
+    """Observe which cars are about to leave, of the slots that have just been observed taken (Bayes' rule)."""
+    scenario, time = scenario_at(search.scenario, 0), search.time
+    viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
+    # Keyed by the millisecond: two observations of a car at the same time have the same error.
+    millisecond = int(time * 1000.0)
+    for i in range(starts[search.vertex], starts[search.vertex + 1]):
+        slot = viewed[i]
+        column = np.int64(int32s(search.columns)[slot])
+        record, k = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
+        block = block_at(search.blocks, column >> BLOCK_BITS)
+        if column == SENTINEL or block.observed_at[k] != time:
+            continue
+        cue, p, prior, decay_rate = (
+            cue_at(search.cue_table, column), block.p_observed[k], block.prior[k], block.decay_rate[k]
+        )  # fmt: skip
+        rate = leaving_rate(search, prior, decay_rate)
+        usual, before, excess = decay_rate * (1.0 - prior) / rate, 0.0, 0.0
+        if record.observed_taken:
+            if cue.excess != 0.0 and cue.at < time:
+                # What the earlier cue has left, of the cars that were still expected to be there
+                gap = time - cue.at
+                there = decay_to_prior(prior, decay_rate, cue.p, gap) - freed(
+                    cue.excess, rate, decay_rate, gap
+                )
+                before = cue.excess * math.exp(-rate * gap) * p / max(there, _LEAST_P)
+            elif cue.at == time:
+                before = cue.excess
+            about_to = min(max(usual * p + before, 0.0), p)
+            seen = keyed_uniform(search.key, CUE_STREAM, slot, millisecond) < (
+                scenario.cue_hit_rate
+                if is_about_to_leave(search, column, time)
+                else scenario.cue_false_alarm_rate
+            )
+            excess = (
+                bayes_update(about_to, seen, scenario.cue_hit_rate, scenario.cue_false_alarm_rate) - usual * p
+            )
+        cue.excess, cue.at, cue.p = excess, time, p
+        if search.cues != 0:
+            float32s(search.cues)[slot] = excess
+
+
+@kernel
+def is_about_to_leave(search: Any, column: int, time: float) -> bool:
+    """Return whether the car in a slot shows that it leaves, from a time that hangs on the slot and its departure."""
+    scenario, record = scenario_at(search.scenario, 0), slot_at(search.slots, column)
+    if not is_taken(search, column, time):
+        return False
+    shared, key = scenario.world_kind == SHARED_KIND, search.key
+    if shared:
+        key = shared_world_at(search.world, 0).key
+    end = end_of_stay(search, column, time)
+    if end == np.inf:
+        return False
+    lead = scenario.lead_s * keyed_exponential(
+        key, LEAD_STREAM, np.int64(record.slot), np.int64(end * 1000.0)
+    )
+    return bool(end - time <= lead)
 
 
 @kernel

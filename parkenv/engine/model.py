@@ -201,8 +201,8 @@ class Model:
     """The generative model of a search.
 
     Args:
-        problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept. A lot with live
-            counts of facilities is refused.
+        problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept. Live counts of
+            facilities, and cues of departures, are refused.
         any_day: whether days may be unlike their forecast, with the probabilities of `belief` (`DayBelief`): an event
             has filled the slots near the goal, or the forecast carries no information, of the day or of single slots.
             `sample` draws all slots from such a day; their later changes follow the forecast.
@@ -210,6 +210,10 @@ class Model:
 
     def __init__(self, problem: SearchProblem, any_day: bool = False) -> None:
         self.problem, self._any_day = problem.public(), any_day
+        require(
+            self.problem.cues is None,
+            f"scenario on {self.problem.lot.name!r} has cues of departures, which the model does not know; want none",
+        )
         require(
             len(self.problem.live_slots) == 0,
             f"lot {self.problem.lot.name!r} has live counts, want one without them",

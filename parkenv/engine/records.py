@@ -60,6 +60,14 @@ PROBLEM_FIELDS: tuple[tuple[str, Any, Value], ...] = (
     ("seen_rate", [np.float64], lambda problem: problem.sensor_rates.seen),
     ("hit_rate", [np.float64], lambda problem: problem.sensor_rates.hit),
     ("false_alarm_rate", [np.float64], lambda problem: problem.sensor_rates.false_alarm),
+    # Cues of departures: mean time, s, 0 without any; P(cue | about to leave); P(cue | not).
+    ("lead_s", np.float64, lambda problem: problem.cues.lead_s if problem.cues else 0.0),
+    ("cue_hit_rate", np.float64, lambda problem: problem.cues.hit_rate if problem.cues else 0.0),
+    (
+        "cue_false_alarm_rate",
+        np.float64,
+        lambda problem: problem.cues.false_alarm_rate if problem.cues else 0.0,
+    ),
 )
 HIDDEN_FIELDS: tuple[tuple[str, Any, Value], ...] = (
     ("window_start", np.float64, lambda scenario: scenario.arrival.start_s),
@@ -181,6 +189,8 @@ SEARCH = _with_costs(
         ("belief", ADDRESS),  # (4, width) float32, as in the observation, or 0
         ("most_observed", np.int64),
         ("step_observed", ADDRESS),  # (4, most_observed) float32, as in the observation, or 0
+        ("cue_table", ADDRESS),  # CUE records by column, or 0 where no scenario has cues
+        ("cues", ADDRESS),  # (2, width) float32, as in the observation, or 0
     ],
     costs=COST_FIELDS[0],
     step_costs=STEP_FIELDS[0],
@@ -202,6 +212,9 @@ SLOT = np.dtype(
     align=True,
 )
 """A slot with a column: true state as in CURSOR, and the search's observations of it."""
+
+CUE = np.dtype([("excess", np.float64), ("at", np.float64), ("p", np.float64)], align=True)
+"""What the last observation of a slot has left: the excess of `belief.cue_belief`, its time, s, and P(taken)."""
 
 SPARSE_SLOTS = 4096
 """Slots from which the tables of a fleet's searches take memory only where they are written."""
@@ -411,7 +424,7 @@ FLEET = np.dtype(
 """A world with many cars; `arrival` is when it begins."""
 
 scenario_at, search_at, edge_at = record_at(SCENARIO), record_at(SEARCH), record_at(EDGE)
-slot_at, block_at = record_at(SLOT), record_at(BLOCK)
+slot_at, block_at, cue_at = record_at(SLOT), record_at(BLOCK), record_at(CUE)
 shared_world_at, shared_slot_at = record_at(SHARED_WORLD), record_at(SHARED_SLOT)
 counted_at, car_at, fleet_at = record_at(COUNTED), record_at(CAR), record_at(FLEET)
 live_slot_at, report_at, step_at = record_at(LIVE_SLOT), record_at(REPORT), record_at(STEP)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from parkenv.belief.cue_belief import freed
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.compiled.arrays import BoolArray
 from parkenv.compiled.memory import float32s, float64s, int32s, int64s
@@ -27,6 +28,7 @@ from parkenv.engine.records import (
     SENTINEL,
     block_at,
     counted_at,
+    cue_at,
     scenario_at,
     shared_slot_at,
     shared_world_at,
@@ -118,7 +120,24 @@ def set_belief_of(search: Any, column: int, observed_taken: bool, p: float, time
 def belief_now(search: Any, column: int) -> float:
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
     elapsed = search.time - block.observed_at[i]
-    return float(decay_to_prior(block.prior[i], block.decay_rate[i], block.p_observed[i], elapsed))
+    p = decay_to_prior(block.prior[i], block.decay_rate[i], block.p_observed[i], elapsed)
+    return float(p if search.cue_table == 0 else p - freed_now(search, column))
+
+
+@kernel
+def freed_now(search: Any, column: int) -> float:
+    """Return how much P(free) is above that without cues, if the slot was observed last when its cue was."""
+    cue, i = cue_at(search.cue_table, column), column & (BLOCK_SIZE - 1)
+    block = block_at(search.blocks, column >> BLOCK_BITS)
+    if cue.excess == 0.0 or cue.at != block.observed_at[i]:
+        return 0.0
+    rate = leaving_rate(search, block.prior[i], block.decay_rate[i])
+    return float(freed(cue.excess, rate, block.decay_rate[i], search.time - cue.at))
+
+
+@inlined
+def leaving_rate(search: Any, prior: float, decay_rate: float) -> float:
+    return float(decay_rate * (1.0 - prior) + 1.0 / scenario_at(search.scenario, 0).lead_s)
 
 
 @kernel
@@ -154,6 +173,12 @@ def decay_belief(search: Any) -> None:
             block.p_occupied[i] = decay_to_prior(
                 block.prior[i], block.decay_rate[i], block.p_observed[i], time - block.observed_at[i]
             )
+    if search.cue_table != 0:
+        for column in range(1, search.n_columns + 1):
+            if cue_at(search.cue_table, column).excess != 0.0:
+                block = block_at(search.blocks, column >> BLOCK_BITS)
+                i = column & (BLOCK_SIZE - 1)
+                block.p_occupied[i] = min(max(block.p_occupied[i] - freed_now(search, column), 0.0), 1.0)
 
 
 @inlined
@@ -172,6 +197,8 @@ def add_column(search: Any, slot: int) -> int:
     record = slot_at(search.slots, column)
     record.slot, record.sojourn, record.valid_until = slot, 0, 0.0
     record.observed = record.observed_taken = record.passed = False
+    if search.cue_table != 0:
+        cue_at(search.cue_table, column).excess = 0.0
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
     prior, rate = forecast_of(search, slot)
     if search.n_forbidden > 0 and is_forbidden(search, slot):
@@ -200,6 +227,34 @@ def find_state(search: Any, record: Any, time: float) -> None:
     else:
         world, cursor = worlds.world_of(search), worlds.cursor_of(record)
         worlds.find_state(scenario.world_kind, search.world, world, slot, cursor, time)
+
+
+@kernel
+def end_of_stay(search: Any, column: int, time: float) -> float:
+    """Return when the car in a taken slot leaves, s; infinite for what stands for a counted facility."""
+    scenario, record = scenario_at(search.scenario, 0), slot_at(search.slots, column)
+    slot = np.int64(record.slot)
+    if scenario.world_kind != SHARED_KIND:
+        own, cursor = worlds.world_of(search), worlds.cursor_of(record)
+        return float(_end_of_stay(scenario.world_kind, search.world, own, slot, cursor, time))
+    world = shared_world_at(search.world, 0)
+    if slot >= world.first_counted:
+        return np.inf
+    shared = shared_slot_at(world.slots, slot)
+    if shared.car != NO_CAR or world.background != PROCESS_BACKGROUND:
+        return float(shared.leaves_at)
+    cursor = worlds.cursor_of(shared)
+    return float(_end_of_stay(world.world_kind, world.world, worlds.world_of(world), slot, cursor, time))
+
+
+@inlined
+def _end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, time: float) -> float:
+    """Look ahead, and leave the cursor where it was."""
+    since, until, sojourn, known = cursor.since, cursor.valid_until, cursor.sojourn, cursor.end_known
+    end = worlds.find_end_of_stay(kind, model, world, slot, cursor, time)
+    cursor.since, cursor.valid_until, cursor.sojourn, cursor.end_known = since, until, sojourn, known
+    cursor.occupied = True
+    return float(end)
 
 
 @kernel
@@ -234,6 +289,13 @@ def init_full_prior(search: Any) -> None:
         for slot in range(n):
             if is_forbidden(search, slot):
                 belief[FORECAST * width + slot], belief[DECAY_RATE * width + slot] = 1.0, 0.0
+    if search.cues != 0:
+        for slot in range(n):
+            forecast, decay_rate = belief[FORECAST * width + slot], belief[DECAY_RATE * width + slot]
+            float32s(search.cues)[slot] = 0.0
+            lead_s = scenario.lead_s
+            rate = leaving_rate(search, forecast, decay_rate) if lead_s > 0.0 else 0.0
+            float32s(search.cues)[width + slot] = rate
     for slot in range(n):
         p_occupied[slot] = belief[P_OBSERVED * width + slot] = belief[FORECAST * width + slot]
         belief[OBSERVED_AT * width + slot] = NEVER_OBSERVED

@@ -16,6 +16,7 @@ from parkenv.engine.records import (
     BLOCK,
     BLOCK_BITS,
     BLOCK_SIZE,
+    CUE,
     DECAY_RATE,
     FORECAST,
     HIDDEN_FIELDS,
@@ -44,6 +45,7 @@ DENSE_SLOTS = 2**24
 """Slots of all searches up to which their tables, a gigabyte then, are in large pages."""
 _ARRAYS = (
     "slots", "blocks", "columns", "external_forecast", "day_error", "p_occupied", "belief", "step_observed",
+    "cue_table", "cues",
 )  # fmt: skip
 """Attributes of `Searches` with a row for each search; the SEARCH field of the name holds the row's address."""
 
@@ -165,7 +167,8 @@ class Searches:
             first use; the first column is the sentinel. m is the number of slots of the largest lot.
         external_forecast: (n, 2, m), forecast and decay rate of priors that only Python can compute; else (0, 2, 0).
         needs_python: whether an arrival is complete only after `complete_arrival`.
-        day_error, p_occupied, belief, step_observed: as the environment observes them; empty if not kept.
+        day_error, p_occupied, belief, step_observed, cues: as the environment observes them; empty if not kept.
+        cue_table: (n, m + 1) of the dtype CUE, by column; empty where no scenario has cues.
     """
 
     def __init__(
@@ -200,6 +203,9 @@ class Searches:
             most_observed = most_observed_in(scenarios.scenarios) if full_belief else 0
         k = most_observed
         self.step_observed = np.zeros((n, 4, k) if k > 0 else (0, 4, 0), np.float32)
+        has_cues = bool((scenarios.records["lead_s"] > 0.0).any())
+        self.cue_table = zeros((n if has_cues else 0, m + 1), CUE)
+        self.cues = np.zeros((n if has_cues and full_belief else 0, 2, m), np.float32)
         self.records["width"], self.records["most_observed"], self.records["n_step_used"] = m, k, k
         self.records["walks"], self.records["reserved"] = 1.0, UNGUIDED
         self.records["scenarios"] = address_of(scenarios.records, SCENARIO)
@@ -219,6 +225,9 @@ class Searches:
         """
         parts = (self.p_occupied, self.belief, self.step_observed, self.day_error)
         return (self.records["clock"][search].copy, *(part[search].reshape(-1).copy for part in parts))
+
+    def copier_of_cues(self, search: int) -> Callable[[], NDArray[Any]] | None:
+        return self.cues[search].reshape(-1).copy if len(self.cues) else None
 
     def complete_arrival(self, search: int) -> None:
         scenario, record = self.scenario_of(search), self.records[search]

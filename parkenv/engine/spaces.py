@@ -21,7 +21,7 @@ from parkenv.world.week import DAY_S
 LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
 OBSERVATIONS = ("full", "occupancy", "local")
 """What a search may observe; see `parkenv.envs.search.SearchEnv`."""
-BELIEF_PARTS = ("belief", "step_observed")  # what `occupancy` leaves out of `full`
+BELIEF_PARTS = ("belief", "step_observed", "cues")  # what `occupancy` leaves out of `full`
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
 _FLAT = ("p_occupied", "day_error", "action_mask")
 
@@ -31,12 +31,13 @@ def space_of(scenarios: Sequence[SearchProblem], most_observed: int | None = Non
     lots = [scenario.lot for scenario in scenarios]
     n_slots, n_vertices = max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots)
     k = most_observed_in(scenarios) if most_observed is None else most_observed
-    return search_space(n_slots, n_vertices, k)
+    return search_space(n_slots, n_vertices, k, any(scenario.cues is not None for scenario in scenarios))
 
 
-def search_space(n_slots: int, n_vertices: int, most_observed: int) -> spaces.Dict:
+def search_space(n_slots: int, n_vertices: int, most_observed: int, cues: bool = False) -> spaces.Dict:
     belief = _box_of_parts([(0.0, 1.0), (0.0, MAX_DECAY_RATE), (0.0, 1.0), (NEVER_OBSERVED, LATEST)], n_slots)
     observed = _box_of_parts([(-1.0, n_slots - 1.0), *[(0.0, 1.0)] * 3], most_observed)
+    further = {"cues": _box_of_parts([(-1.0, 1.0), (0.0, MAX_DECAY_RATE)], n_slots)} if cues else {}
     return spaces.Dict(
         {
             "vertex": spaces.Discrete(n_vertices),
@@ -46,6 +47,7 @@ def search_space(n_slots: int, n_vertices: int, most_observed: int) -> spaces.Di
             "step_observed": observed,
             "day_error": spaces.Box(0.0, MAX_LOGITS, (2,), np.float32),
             "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
+            **further,
         }
     )
 

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
 
 _REBUILT = {
-    "searches", "scenario", "_state", "_address", "_copiers", "_scenario_index", "_step", "_copy_mask", "_copy_masks",
-    "_seeded_with", "_begun", "_over",
+    "searches", "scenario", "_state", "_address", "_copiers", "_copy_cues", "_scenario_index", "_step", "_copy_mask",
+    "_copy_masks", "_seeded_with", "_begun", "_over",
 }  # fmt: skip
 
 
@@ -84,6 +84,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | `step_observed` | `Box((4 * k,), float32)` | what the last step observed, four parts as below |
     | `day_error` | `Box(0, 5, (2,), float32)` | how far whole days differ from the forecast, logits, as below |
     | `action_mask` | `Box(0, 1, (5,), int8)` | the valid actions at this vertex |
+    | `cues` | `Box((2 * n_slots,), float32)` | only with `scenario.cues`: what shows that cars leave, two parts below |
 
     `belief` has four parts of n_slots numbers each; unpack them with
     `forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)`:
@@ -113,6 +114,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     An observation updates the belief in a slot by Bayes' rule; then the belief decays to the forecast:
     `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
+
+    `cues` is for slots that were observed taken. Part 0 is P(taken, and the car is about to leave) right after the last
+    observation, beyond what is usual for a taken slot; part 1 the rate, 1/s, at which such a car leaves, constant in an
+    episode. `p_occupied` is then lower, see `parkenv.belief.cue_belief`.
 
     ## Rewards
     Minus the duration of the step, s. Parking also subtracts the walk to the goal and the slot's parking cost
@@ -245,7 +250,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.searches = Searches(ScenarioRecords(self.scenarios), 1, full_belief=True)
         self._address, self._needs_python = self.searches.address, self.searches.needs_python
         self._state = SearchState(self.searches)
-        self._copiers = self.searches.copiers(0)
+        self._copiers, self._copy_cues = self.searches.copiers(0), self.searches.copier_of_cues(0)
         self._copy_masks = [[mask.copy for mask in scenario.action_masks] for scenario in self.scenarios]
         self._scenario_index = -1
         self._enter_scenario()
@@ -398,7 +403,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             smaller = self._smaller_observation(vertex)
             return smaller if self._flat is None else self._flat(smaller)
         time, p_occupied, belief, step_observed, day_error = self._copiers
-        return {
+        observation = {
             "vertex": self._vertices[vertex],
             "time": time(),
             "p_occupied": p_occupied(),
@@ -407,6 +412,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "day_error": day_error(),
             "action_mask": self._copy_mask[vertex](),
         }
+        if self._copy_cues is not None:
+            observation["cues"] = self._copy_cues()
+        return observation
 
     def _smaller_observation(self, vertex: int) -> dict[str, Any]:
         mask = self._copy_mask[vertex]()

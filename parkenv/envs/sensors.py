@@ -30,6 +30,13 @@ class SensingSearchEnv(SearchEnv):
     _sampler: SensorSampler
     _before: tuple[int, float] | None = None
 
+    def _make_search(self) -> None:
+        require(
+            all(scenario.cues is None for scenario in self.scenarios),
+            "cues of departures are not simulated for sensors; want a scenario without them, or parkenv/Search-v2",
+        )
+        super()._make_search()
+
     @property
     def rig(self) -> SensorRig:
         return self._sampler.rig

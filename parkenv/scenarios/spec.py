@@ -51,6 +51,7 @@ from parkenv.files.spec_file import (
     resolved_path,
 )
 from parkenv.files.user_class import find_module
+from parkenv.world.cues import LEAD_S
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
@@ -565,6 +566,21 @@ class SensorModelSpec(Spec):
         return self
 
 
+def _cues_table(text: str) -> dict[str, Any]:
+    if text == "perfect":
+        return {}
+    hit, false_alarm, *lead = numbers_in(text)
+    return {"hit_rate": hit, "false_alarm_rate": false_alarm, **({"lead_s": lead[0]} if lead else {})}
+
+
+class CuesSpec(Spec):
+    """Cars that show that they are about to leave, and how well that is observed."""
+
+    lead_s: float = Field(LEAD_S, gt=0.0, le=3600.0, description="Mean time before the departure, s.")
+    hit_rate: Probability = Field(1.0, description="P(cue observed | about to leave).")
+    false_alarm_rate: Probability = Field(0.0, description="P(cue observed | not about to leave).")
+
+
 class TrafficSpec(Spec):
     """Other road users."""
 
@@ -735,6 +751,14 @@ class ScenarioSpec(Spec):
         takes="NAME|FILE",
         panel="Sensors",
         default="the scenario's; with --rig, the rig's",
+    )
+    cues: Annotated[CuesSpec, _from_text(_cues_table), OrText()] | None = option(
+        None,
+        "Cars show that they are about to leave. perfect: without error; or P(cue | about to leave) and P(cue | not) "
+        "at each observation, and the mean time before the departure, s.",
+        takes="perfect|HIT,FALSE_ALARM[,LEAD_S]",
+        panel="World",
+        default="none",
     )
     rig: RigName = Field("laser", description="The simulated sensors of the car.")
     detector: PackagedDetector = Field(

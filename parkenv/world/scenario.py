@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import nearest, require, require_keywords, require_whole
 from parkenv.files.field_types import NotNegative, Positive, Validated
+from parkenv.world.cues import Cues
 from parkenv.world.demand import Demand, TownDemand
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -78,6 +79,7 @@ class SearchProblem(Validated):
         classes: classes of users that the driver belongs to, beside `public`.
         kwh: kWh that the car takes where it can charge.
         walk_back: whether the walk from the goal back to the car counts, too.
+        cues: what shows that cars are about to leave; None: nothing.
 
     Raises:
         InputError: a value out of its range; the message names the field.
@@ -98,6 +100,7 @@ class SearchProblem(Validated):
     classes: tuple[str, ...] = ()
     kwh: NotNegative = 0.0
     walk_back: bool = False
+    cues: InstanceOf[Cues] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -288,7 +291,7 @@ class SearchProblem(Validated):
     @property
     def observes_exactly(self) -> bool:
         """Whether slots in view are observed without error, and nothing is known of others."""
-        return self.sensor_model.perfect and not len(self.live_slots)
+        return self.sensor_model.perfect and not len(self.live_slots) and self.cues is None
 
     @cached_property
     def live_drive_s(self) -> FloatArray:

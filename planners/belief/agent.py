@@ -44,6 +44,7 @@ may have been the last one for a long time.
 ROWS = 40  # of the table of drives of a part that are computed at each decision on the way there: some 3 ms
 STALE_S = 60.0  # s without a newly observed slot after which the search moves on to another part of the lot
 PREVIEW_S = 60.0  # s, horizon of the plan preview
+NEWS = 0.1  # excess of P(about to leave) from which a cue is news
 _NO_COURSE = Course(np.zeros(0, np.int64), -1, math.nan)
 
 
@@ -73,6 +74,7 @@ class BeliefSearch:
     state: NDArray[np.int8]  # (n_slots,) int8, `SlotBelief.state` at the last decision
     # (n_slots,) float64, the highest detection rate among the views from which a slot was not detected
     missed_rate: FloatArray
+    cued: NDArray[np.bool_]  # (n_slots,) whether a car seemed about to leave at the last decision
     time: float  # s since the search began, at the last decision
     # s, the last time at which an unobserved slot of the part was observed, or the part was chosen
     news_at: float
@@ -195,6 +197,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             day=self._day_belief(near, belief, crowd),
             state=np.full(n, UNOBSERVED, dtype=np.int8),
             missed_rate=np.zeros(n),
+            cued=np.zeros(n, np.bool_),
             time=belief.time,
             news_at=belief.time,
             paths=path_buffers(len(FAILURE_COSTS) + 1, n, len(near.vertices)),
@@ -257,6 +260,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         if changed or memory.course.heading in known.observations.slots:
             memory.course = memory.course._replace(heading=-1)
         memory.state = state
+        cued = known.cues[: near.n_slots] > NEWS if len(known.cues) else memory.cued
+        if (cued & ~memory.cued).any():
+            memory.remaining_s = math.inf
+        memory.cued = cued
         here = near.index(vertex)
         if belief.time > memory.time:
             memory.day.update(known.observations)
@@ -339,5 +346,5 @@ def snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapsh
     slots["missed_rate"], slots["state"] = memory.missed_rate, memory.state
     belief = BeliefSnapshot(slots, *memory.day.mixture())
     drive_s = memory.near.table.seconds[here]
-    set_slots(belief, known.parts, memory.day.p_occupied(known.time), drive_s)
+    set_slots(belief, known.parts, known.cues, known.time, memory.day.p_occupied(known.time), drive_s)
     return belief

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.cue_belief import freed
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
@@ -150,8 +151,15 @@ class BeliefSnapshot(NamedTuple):
 
 
 @leaf
-def set_slots(belief: BeliefSnapshot, parts: FloatArray, p_occupied: FloatArray, drive_s: FloatArray) -> None:
-    """Fill in all but what was observed, from `SlotBelief.parts`, P(taken) now and drives from the car, s."""
+def set_slots(
+    belief: BeliefSnapshot,
+    parts: FloatArray,
+    cues: FloatArray,
+    time: float,
+    p_occupied: FloatArray,
+    drive_s: FloatArray,
+) -> None:
+    """Fill in all but what was observed, from `SlotBelief`, P(taken) now but for cues, and drives from the car, s."""
     n = len(belief.slots)
     for s in range(n):
         forecast, decay_rate, at = parts[s], parts[n + s], belief.slots[s]
@@ -161,6 +169,13 @@ def set_slots(belief: BeliefSnapshot, parts: FloatArray, p_occupied: FloatArray,
         rate = leaving / usual
         if at.state == OBSERVED_TAKEN and len(belief.weights) > 1:
             rate = _rate_of_return(leaving, usual, belief.weights, belief.p_free_if[s])
+        if len(cues) and cues[s] > 0.0 and at.state == OBSERVED_TAKEN:
+            gap, arriving = time - parts[3 * n + s], leaving / usual - leaving
+            p_free += freed(cues[s], cues[n + s], leaving / usual, gap)
+            # Until it is known what becomes of it, the slot is one whose car leaves at the rate of now.
+            announced = cues[s] * math.exp(-cues[n + s] * gap)
+            leaving += cues[n + s] * announced / max(1.0 - p_free, announced)
+            usual, rate = leaving / (leaving + arriving), leaving + arriving
         on_arrival = usual + (p_free - usual) * math.exp(-rate * drive_s[s] if drive_s[s] < np.inf else 0.0)
         at.p_free, at.p_free_usual, at.decay_rate, at.leaving = p_free, usual, rate, leaving
         at.odds = (1.0 - on_arrival) / on_arrival if on_arrival > 0.0 else np.inf

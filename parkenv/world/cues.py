@@ -1,0 +1,42 @@
+"""Cues: what shows that a parked car is about to leave, such as somebody who gets in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from parkenv.errors import require
+from parkenv.files.field_types import Positive, Probability, Validated
+
+LEAD_S = 31.0
+"""Mean time from the first cue to the departure, s.
+
+It is the mean of 220 drivers at a mall from the open door on, while a car waited for the space; without one, 27 s
+(Ruback and Juieng, Territorial defense in parking lots, Journal of Applied Social Psychology 27, 1997).
+"""
+
+
+@dataclass(frozen=True)
+class Cues(Validated):
+    """Departures that announce themselves, and how well that is observed of a car whose slot is observed.
+
+    The time from the first cue to the departure is exponential, and never longer than the stay.
+
+    Args:
+        lead_s: its mean, s.
+        hit_rate: P(cue observed | about to leave), at each observation of the slot.
+        false_alarm_rate: P(cue observed | not about to leave).
+
+    Raises:
+        InputError: a value out of its range, or uninformative cues (equal rates).
+    """
+
+    lead_s: Positive = LEAD_S
+    hit_rate: Probability = 1.0
+    false_alarm_rate: Probability = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.hit_rate > self.false_alarm_rate,
+            f"cues: hit_rate is {self.hit_rate:g}, want it above false_alarm_rate, {self.false_alarm_rate:g}",
+        )

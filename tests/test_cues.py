@@ -1,0 +1,181 @@
+"""Cues of departures: what they say of the future, in what they are observed, and what they are worth."""
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from command_line import parkenv as command
+from scipy.linalg import expm
+
+import parkenv
+from parkenv import InputError, OccupancyProcess, lot_v0
+from parkenv.belief.cue_belief import freed
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.world.cues import Cues
+from planners import make_agent
+
+N_SEARCHES = 120
+
+
+def busy(cues=None, p=0.95, stay_s=600.0, name="campus"):
+    """A lot with cars that come and go fast."""
+    scenario = parkenv.make_scenario(name)
+    n, hours = scenario.lot.n_slots, np.ones(168)
+    leaving = np.full(n, 1.0 / stay_s)
+    world = OccupancyProcess(leaving * p / (1.0 - p), hours, leaving, hours)
+    return scenario.replace(occupancy=world, prior=None, cues=cues)
+
+
+def wandering(scenario, seeds=range(N_SEARCHES), steps=12):
+    """Yield observations and states along random drives, after steps that end at a new moment."""
+    env, rng = gym.make("parkenv/Search-v2", scenario=scenario), np.random.default_rng(0)
+    for seed in seeds:
+        observation, _ = env.reset(seed=seed)
+        for _ in range(steps):
+            moves = np.flatnonzero(observation["action_mask"][:4])
+            observation, *_ = env.step(int(rng.choice(moves)))
+            yield observation, env.unwrapped.state
+
+
+@pytest.mark.parametrize("decay_rate", [1 / 40, 1 / 30, 1 / 3])
+@pytest.mark.parametrize("p", [0.3, 0.97])
+def test_p_free_after_a_cue_is_that_of_the_chain(p, decay_rate):
+    """Three states: taken, about to leave, free."""
+    arriving, leaving = p * decay_rate, (1.0 - p) * decay_rate
+    rate = leaving + 1 / 30
+    usual = leaving / rate
+    rates = np.array(
+        [
+            [-leaving, leaving, 0.0],
+            [0.0, -rate, rate],
+            [arriving * (1.0 - usual), arriving * usual, -arriving],
+        ]
+    )
+    for about in (0.0, 0.4, 1.0):
+        for t in (0.5, 10.0, 60.0, 600.0):
+            free = (np.array([1.0 - about, about, 0.0]) @ expm(rates * t))[2]
+            without = (1.0 - p) * (1.0 - np.exp(-decay_rate * t))
+            assert without + freed(about - usual, rate, decay_rate, t) == pytest.approx(free, abs=1e-6)
+
+
+def test_a_perfect_cue_shows_nearly_all_that_leave_and_nothing_else():
+    scenario, to_leave, others = busy(Cues()), [], []
+    n = scenario.lot.n_slots
+    for observation, state in wandering(scenario):
+        slots, taken, *_ = observation["step_observed"].reshape(4, -1)
+        seen = slots[(slots >= 0) & (taken == 1)].astype(int)
+        left_s = state.world.next_free(seen, state.time) - state.time
+        shown = observation["cues"][seen] > 0.5
+        to_leave += left_s[shown].tolist()
+        others += left_s[~shown].tolist()
+        assert (observation["cues"][:n][np.setdiff1d(slots[slots >= 0], seen).astype(int)] == 0.0).all()
+    rate = 1 / 31 + 1 / 600
+    assert len(to_leave) > 200
+    assert np.mean(to_leave) == pytest.approx(1.0 / rate, rel=0.2)
+    assert np.mean(np.array(others) < 2.0) < 0.001
+    assert len(to_leave) / (len(to_leave) + len(others)) == pytest.approx((1 / 600) / rate, rel=0.3)
+
+
+@pytest.mark.parametrize("cues", [Cues(), Cues(90.0, 0.5, 0.02)], ids=["perfect", "sensed"])
+def test_the_belief_after_cues_is_calibrated(cues):
+    """P(free) half a minute after an observation, by how much the cue says, is how often the slot is free then."""
+    scenario = busy(cues)
+    n, said, true, before = scenario.lot.n_slots, [], [], set()
+    for observation, state in wandering(scenario, range(500)):
+        slots = np.flatnonzero(observation["cues"][:n] > 0.05)
+        # Once a car: what follows is not independent.
+        slots = np.array([slot for slot in slots if (state.key, slot) not in before], int)
+        before |= {(state.key, slot) for slot in slots}
+        later = SlotBelief.of_observation(observation).decay(30.0)
+        said += (1.0 - later.p_occupied[slots]).tolist()
+        true += (~state.world.occupied(slots, state.time + 30.0)).tolist()
+    assert len(said) > 200
+    assert np.mean(said) > 0.1
+    assert np.mean(said) == pytest.approx(np.mean(true), abs=0.07)
+
+
+def test_without_cues_all_is_as_before_and_with_them_the_world_is_the_same():
+    plain, cued = busy(), busy(Cues())
+    space = gym.make("parkenv/Search-v2", scenario=plain).observation_space
+    assert "cues" not in space.spaces
+    for seed in range(5):
+        totals = [
+            parkenv.simulate(
+                gym.make("parkenv/Search-v2", scenario=scenario),
+                make_agent("first-free", scenario),
+                seed=seed,
+            ).info["total_s"]
+            for scenario in (plain, cued)
+        ]
+        assert totals[0] == totals[1]
+
+
+def test_single_batched_local_and_copied_searches_observe_the_same():
+    scenario = busy(Cues(60.0, 0.8, 0.05))
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    local = gym.make("parkenv/Search-v2", scenario=scenario, observation="local")
+    outside = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario))
+    batch = gym.make_vec("parkenv/Search-v2", 1, scenario=scenario)
+    assert env.observation_space.contains(env.reset(seed=3)[0])
+    local.reset(seed=3), outside.reset(seed=3), batch.reset(seed=3)
+    for k in range(40):
+        action = k // 5 % 4
+        seen, *_ = env.step(action)
+        here, there = local.step(action)[0], outside.step(action)[0]
+        many, *_ = batch.step(np.array([action]))
+        np.testing.assert_array_equal(here["local"], there["local"])
+        for name, value in seen.items():
+            np.testing.assert_array_equal(value, many[name][0])
+        if k == 20:
+            env = pickle.loads(pickle.dumps(env))
+        later = SlotBelief.of_observation(seen).decay(0.0)
+        np.testing.assert_allclose(later.p_occupied, seen["p_occupied"], atol=1e-6)
+
+
+@pytest.mark.parametrize("background", ["process", "residents"])
+def test_cars_of_a_fleet_and_of_its_background_show_that_they_leave(background):
+    env = lot_v0.parallel_env(busy(Cues()), cars=4, tick_s=5.0, background=background)
+    shown, agents = 0, env.reset(seed=0)[0]
+    for _ in range(400):
+        if not env.agents:
+            break
+        actions = {car: int(seen["action_mask"].argmax()) for car, seen in agents.items()}
+        agents, *_ = env.step(actions)
+        for car, seen in agents.items():
+            assert env.observation_space(car).contains(seen)
+            shown += int((seen["cues"].reshape(2, -1)[0] > 0.5).sum())
+    assert shown > 0
+
+
+@pytest.mark.slow
+def test_belief_gains_from_cues_in_a_nearly_full_lot():
+    totals = {}
+    for cues in (None, Cues(20.0), Cues(20.0, 0.5, 0.02)):
+        scenario = busy(cues, p=0.995, stay_s=1800.0)
+        env, agent = gym.make("parkenv/Search-v2", scenario=scenario), make_agent("belief", scenario)
+        totals[cues] = np.array(
+            [parkenv.simulate(env, agent, seed=seed).info["total_s"] for seed in range(100)]
+        )
+    none, perfect, sensed = totals.values()
+    assert (perfect - none).mean() < -20.0
+    assert (sensed - none).mean() < -20.0
+
+
+def test_what_does_not_know_cues_says_so(tmp_path):
+    with pytest.raises(InputError, match=r"hit_rate is 0.1, want it above false_alarm_rate, 0.1"):
+        Cues(hit_rate=0.1, false_alarm_rate=0.1)
+    with pytest.raises(InputError, match=r"cues of departures, which the model does not know"):
+        parkenv.model(busy(Cues()))
+    with pytest.raises(InputError, match=r"cues of departures are not simulated for sensors"):
+        gym.make("parkenv/SearchPerception-v2", scenario=busy(Cues()))
+    done = command("compare", "--cues", "often", "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+
+
+def test_the_command_line_and_files_have_cues():
+    for given in ("perfect", "1,0,31", {"lead_s": 31.0}):
+        assert parkenv.make_scenario({"base": "mini", "cues": given}).cues == Cues()
+    assert parkenv.make_scenario({"base": "mini", "cues": "0.5,0.01"}).cues == Cues(31.0, 0.5, 0.01)
