@@ -27,7 +27,7 @@ def freed(excess: float, rate: float, decay_rate: float, elapsed: float) -> floa
 
     Examples:
         >>> [round(freed(0.99, 1 / 30, 1 / 600, t), 3) for t in (0.0, 30.0, 100.0, 1e4)]
-        [0.0, 0.607, 0.844, 0.0]
+        [0.0, 0.608, 0.845, 0.0]
     """
     gap = rate - decay_rate
     if abs(gap) < 1e-6 * rate:
