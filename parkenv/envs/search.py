@@ -115,8 +115,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     An observation updates the belief in a slot by Bayes' rule; then the belief decays to the forecast:
     `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
 
-    `cues` has two parts. Part 0 is P(the car is about to leave) right after a slot was observed taken, beyond the usual;
-    part 1 the rate, 1/s, at which such a car leaves. They lower `p_occupied`, see `parkenv.belief.cue_belief`.
+    `cues` has two parts: P(the car is about to leave) right after a slot was observed taken, beyond the usual, and the
+    rate, 1/s, at which such a car leaves. They lower `p_occupied`, see `parkenv.belief.cue_belief`.
 
     ## Rewards
     Minus the duration of the step, s. Parking also subtracts the walk to the goal and the slot's parking cost
