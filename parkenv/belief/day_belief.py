@@ -152,7 +152,7 @@ class DayBelief:
             p_taken = 1.0 - 1.0 / (1.0 / (1.0 - p_taken) + gone[:, None])
         self._log_weight, self._p_taken = np.log(np.maximum(weight, 1e-300)), p_taken
         self._evidence = np.ones(len(forecast)) if evidence is None else evidence
-        self._taken_if = p_taken ** self._evidence[:, None]
+        self._taken_if = (1.0 - (1.0 - p_taken)) ** self._evidence[:, None]  # rounded as 1 - P(free)
         self._forecast, self._decay_rate = (
             belief.forecast.astype(np.float64),
             belief.decay_rate.astype(np.float64),
@@ -199,10 +199,13 @@ class DayBelief:
         p_taken = _decayed(self._p_taken[slots], leaving, self._p_then[slots], elapsed)
         return _weights(self._log_weight), p_taken
 
-    def mixture(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the hypotheses that matter: weights, (k,), P(free) and the likelihood of "taken", (n_slots, k)."""
+    def mixture(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the hypotheses that matter, and what the slots say of them.
+
+        These are their weights, (k,); P(free) and the likelihood of "taken", (n_slots, k); `evidence`, (n_slots,).
+        """
         weight, p_free, taken_if = _mixture(self._log_weight, self._p_taken, self._taken_if)
-        return weight, p_free, taken_if
+        return weight, p_free, taken_if, self._evidence
 
     def p_occupied(self, time: float) -> FloatArray:
         """P(taken) of each slot at a time, s since the search began, (n_slots,), observed or not."""

@@ -148,6 +148,7 @@ class BeliefSnapshot(NamedTuple):
     # (n_slots, k) float64, likelihood of each of them if the slot is observed taken: 1 - P(free), or nearer to 1 at a
     # kerb, whose slots fill together
     taken_if: FloatArray
+    evidence: FloatArray  # (n_slots,) float64, 1, or less at a kerb
 
 
 @leaf

@@ -174,9 +174,9 @@ def _observe_here(
                 p_free += weights[h] * p_free_if[h]
             # Where the car would park, going on means that the slot was taken.
             if cost_s <= value:
-                taken_if, p_taken = belief.taken_if[s], 0.0
-                for h in range(len(weights)):
-                    p_taken += weights[h] * taken_if[h]
+                taken_if, p_taken = belief.taken_if[s], 1.0 - p_free
+                if belief.evidence[s] < 1.0:
+                    p_taken = (weights * taken_if).sum()
                 rest = 1.0 / max(p_taken, 1e-9)
                 for h in range(len(weights)):
                     weights[h] *= taken_if[h] * rest
