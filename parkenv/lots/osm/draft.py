@@ -45,6 +45,7 @@ from parkenv.lots.osm.parking import (
     CORRIDOR,
     ENTRANCE_REACH,
     Area,
+    CrossedOutlineError,
     Junctions,
     areas_of,
     exterior_rings,
@@ -468,7 +469,15 @@ def outline_draft(
         raise InputError(
             f"{len(drawn):,} parking spaces, want at most {MOST_SPACES:,} in one lot; divide it by --split or --bounds"
         )
-    areas = within([Area.of(e, frame, simple=True) for e in drawn], options.box(frame))
+    readable, crossing = list[Area](), list[str]()
+    for element in drawn:
+        try:
+            readable.append(Area.of(element, frame, simple=True))
+        except CrossedOutlineError as error:
+            crossing.append(element.id)
+            if len(crossing) == len(drawn):
+                raise error from None
+    areas = within(readable, options.box(frame))
     _refuse_swapped(areas)
     validate_areas(
         [a.element.id for a in areas], shapely.area(np.array([a.polygon for a in areas], dtype=object))
@@ -478,7 +487,7 @@ def outline_draft(
         for wanted in (is_building, is_parking_area)
     )
     kept, unused = usable_spaces(areas, parking)
-    left_out: dict[str, list[str]] = {}
+    left_out = {"outlines that cross themselves": crossing}
     for area, reason in unused:
         left_out.setdefault(reason, []).append(area.element.id)
     if not kept:

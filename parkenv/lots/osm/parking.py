@@ -454,6 +454,10 @@ NOT_WALKED_TO = ("garage", "garages", "carport", "roof", "shed", "parking", "hut
 """Values of `building` that are not goals."""
 
 
+class CrossedOutlineError(InputError):
+    """An outline crosses itself."""
+
+
 @dataclass(frozen=True, eq=False)
 class Area:
     """A closed element and its outline, m in the lot's frame."""
@@ -472,7 +476,8 @@ class Area:
         for polygon in (*outer, *holes):
             if simple and not element.cut and not polygon.is_valid:
                 reason = shapely.is_valid_reason(polygon).split("[")[0]
-                raise InputError(f"{element.id}: its outline is not a simple one: {reason}")
+                fault = CrossedOutlineError if polygon.area > 0.0 else InputError
+                raise fault(f"{element.id}: its outline is not a simple one: {reason}")
         if element.tags.get("amenity") == "parking_space" and simple and len(outer) == 1 and not holes:
             # The rectangle of a space depends on the corner that its outline begins at; a union would move it.
             return cls(element, outer[0])
