@@ -13,7 +13,7 @@ Inference Under Distribution Shift. NeurIPS 2021).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -80,7 +80,7 @@ class DayForecast:
     def sd(self) -> FloatArray:
         return np.asarray(np.sqrt(self.covariance[:, :, DIAGONAL, DIAGONAL].astype(float)))
 
-    @property
+    @cached_property
     def level_sd(self) -> FloatArray:
         """(c, d) standard deviation of the day's mean level, log-odds: the day error."""
         return np.asarray(np.sqrt(self.covariance.mean(axis=(2, 3), dtype=float)))
