@@ -170,9 +170,10 @@ def test_what_does_not_know_cues_says_so(tmp_path):
         parkenv.model(busy(Cues()))
     with pytest.raises(InputError, match=r"cues of departures are not simulated for sensors"):
         gym.make("parkenv/SearchPerception-v2", scenario=busy(Cues()))
-    done = command("compare", "--cues", "often", "--out", tmp_path / "run")
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
+    for given in ("often", "0.5", "0.5,0.1,31,9"):
+        done = command("compare", "--cues", given, "--out", tmp_path / "run")
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
 
 
 def test_the_command_line_and_files_have_cues():

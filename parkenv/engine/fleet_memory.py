@@ -251,8 +251,8 @@ class FleetMemory:
             "action_mask": self._mask(car, vertex),
         }
         searches, row = self._rows[address]
-        if len(searches.cues):
-            observation["cues"] = searches.cues[row].reshape(-1).copy()
+        if (copy_cues := searches.copier_of_cues(row)) is not None:
+            observation["cues"] = copy_cues()
         if self._is_guided:
             reserved = self.search_of(address)["reserved"]
             own = np.arange(len(self.slots)) == reserved

@@ -61,13 +61,9 @@ PROBLEM_FIELDS: tuple[tuple[str, Any, Value], ...] = (
     ("hit_rate", [np.float64], lambda problem: problem.sensor_rates.hit),
     ("false_alarm_rate", [np.float64], lambda problem: problem.sensor_rates.false_alarm),
     # Cues of departures: mean time, s, 0 without any; P(cue | about to leave); P(cue | not).
-    ("lead_s", np.float64, lambda problem: problem.cues.lead_s if problem.cues else 0.0),
-    ("cue_hit_rate", np.float64, lambda problem: problem.cues.hit_rate if problem.cues else 0.0),
-    (
-        "cue_false_alarm_rate",
-        np.float64,
-        lambda problem: problem.cues.false_alarm_rate if problem.cues else 0.0,
-    ),
+    ("lead_s", np.float64, lambda problem: getattr(problem.cues, "lead_s", 0.0)),
+    ("cue_hit_rate", np.float64, lambda problem: getattr(problem.cues, "hit_rate", 0.0)),
+    ("cue_false_alarm_rate", np.float64, lambda problem: getattr(problem.cues, "false_alarm_rate", 0.0)),
 )
 HIDDEN_FIELDS: tuple[tuple[str, Any, Value], ...] = (
     ("window_start", np.float64, lambda scenario: scenario.arrival.start_s),

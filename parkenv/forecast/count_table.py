@@ -115,7 +115,7 @@ class Clock:
             return False
 
 
-def told(faults: Mapping[str, int]) -> str:
+def listed_faults(faults: Mapping[str, int]) -> str:
     """Return in words how many rows or readings have each fault."""
     return ", ".join(f"{rule.replace('_', ' ')} {n:,}" for rule, n in faults.items() if n)
 

@@ -29,7 +29,16 @@ import numpy as np
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.files.option import columns_in
-from parkenv.forecast.count_table import DAY_S, FIRST_DAY, HOUR_S, UNKNOWN, Clock, folded, titled_rows, told
+from parkenv.forecast.count_table import (
+    DAY_S,
+    FIRST_DAY,
+    HOUR_S,
+    UNKNOWN,
+    Clock,
+    folded,
+    listed_faults,
+    titled_rows,
+)
 from parkenv.forecast.count_table import NAMES as COUNT_NAMES
 
 MAX_STATE_S = 72 * HOUR_S
@@ -149,7 +158,7 @@ def read_events(
     states = table.cleaned(_Rows(bay, start, end, values[:, 3] > 0))
     faults = {rule: n for rule, n in table.faults.items() if n}
     if not states[0].size:
-        raise InputError(f"{source}: has no states of bays, want some ({told(faults) or 'no row'})")
+        raise InputError(f"{source}: has no states of bays, want some ({listed_faults(faults) or 'no row'})")
     return Events(tuple(table.bays), int(first) + FIRST_DAY, *states, faults)
 
 

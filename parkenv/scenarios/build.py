@@ -18,7 +18,7 @@ from parkenv.errors import InputError, naming, nearest, require, require_keyword
 from parkenv.files.known_names import SAME_SLOTS
 from parkenv.files.option import parse_call
 from parkenv.files.user_class import load_class
-from parkenv.forecast.count_table import told
+from parkenv.forecast.count_table import listed_faults
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
 from parkenv.scenarios.spec import (
     CountsSpec,
@@ -236,8 +236,9 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
         file = RecordedFile(tuple(spec.log), spec.timezone, None, spec.columns)
         if file.is_counts:
             require(len(spec.log) == 1, f"log is {len(spec.log)} files of counts, want one")
-            require(len(spec.car_parks or "1") == 1, "car_parks: want one")
-            return _occupancy(spec.as_counts(*(spec.car_parks or (None,))), lot, goal)
+            names = spec.car_parks or (None,)
+            require(len(names) == 1, "car_parks: want one")
+            return _occupancy(spec.as_counts(names[0]), lot, goal)
         log = _log(file, tuple(map(_changed, spec.log)))
         _warn_of_faults(log.faults, log.source)
         mapped = None
@@ -332,7 +333,7 @@ def _counted(occupancy: OccupancySpec, spec: CountsSpec, lot: ParkingLot, goal: 
 
 
 def _warn_of_faults(faults: Mapping[str, int], source: str) -> None:
-    text = told({name: n for name, n in faults.items() if name not in ("summer_time", "gap")})
+    text = listed_faults({name: n for name, n in faults.items() if name not in ("summer_time", "gap")})
     if text:
         warnings.warn(f"{source}: readings corrected or left out: {text}", stacklevel=2)
 

@@ -569,8 +569,10 @@ class SensorModelSpec(Spec):
 def _cues_table(text: str) -> dict[str, Any]:
     if text == "perfect":
         return {}
-    hit, false_alarm, *lead = numbers_in(text)
-    return {"hit_rate": hit, "false_alarm_rate": false_alarm, **({"lead_s": lead[0]} if lead else {})}
+    numbers = numbers_in(text)
+    if len(numbers) not in (2, 3):
+        raise ValueError("perfect, or HIT,FALSE_ALARM[,LEAD_S]")
+    return dict(zip(("hit_rate", "false_alarm_rate", "lead_s"), numbers, strict=False))
 
 
 class CuesSpec(Spec):

@@ -12,7 +12,7 @@ import numpy as np
 
 from parkenv.errors import InputError
 from parkenv.forecast.comparison import MODELS, Compared, compare
-from parkenv.forecast.count_table import told
+from parkenv.forecast.count_table import listed_faults
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
 from parkenv.forecast.slot_comparison import ComparedSlots, compare_slot_days
@@ -143,7 +143,7 @@ def _told_faults(log: OccupancyLog) -> Row:
 
 
 def _log_faults(log: OccupancyLog) -> list[str]:
-    return [f"Rows corrected or left out: {told(log.faults)}"] if any(log.faults.values()) else []
+    return [f"Rows corrected or left out: {listed_faults(log.faults)}"] if any(log.faults.values()) else []
 
 
 def _evaluate_log(

@@ -375,6 +375,7 @@ def p_free_when_first_observed(
     p_free: float = mean_over_days(weights, belief.p_free_if[slot])
     if taken_follows:
         taken_if = belief.taken_if[slot]
+        # Where a slot stands alone the mean is 1 - P(free), which takes no second sum.
         scale = 1.0 / (1.0 - p_free if belief.evidence[slot] == 1.0 else mean_over_days(weights, taken_if))
         for h in range(len(weights)):
             weights[h] *= taken_if[h] * scale
