@@ -236,7 +236,7 @@ def end_of_stay(search: Any, column: int, time: float) -> float:
     slot = np.int64(record.slot)
     if scenario.world_kind != SHARED_KIND:
         own, cursor = worlds.world_of(search), worlds.cursor_of(record)
-        return float(_end_of_stay(scenario.world_kind, search.world, own, slot, cursor, time))
+        return float(worlds.find_end_of_stay(scenario.world_kind, search.world, own, slot, cursor, time))
     world = shared_world_at(search.world, 0)
     if slot >= world.first_counted:
         return np.inf
@@ -244,17 +244,8 @@ def end_of_stay(search: Any, column: int, time: float) -> float:
     if shared.car != NO_CAR or world.background != PROCESS_BACKGROUND:
         return float(shared.leaves_at)
     cursor = worlds.cursor_of(shared)
-    return float(_end_of_stay(world.world_kind, world.world, worlds.world_of(world), slot, cursor, time))
-
-
-@inlined
-def _end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, time: float) -> float:
-    """Look ahead, and leave the cursor where it was."""
-    since, until, sojourn, known = cursor.since, cursor.valid_until, cursor.sojourn, cursor.end_known
-    end = worlds.find_end_of_stay(kind, model, world, slot, cursor, time)
-    cursor.since, cursor.valid_until, cursor.sojourn, cursor.end_known = since, until, sojourn, known
-    cursor.occupied = True
-    return float(end)
+    day = worlds.world_of(world)
+    return float(worlds.find_end_of_stay(world.world_kind, world.world, day, slot, cursor, time))
 
 
 @kernel

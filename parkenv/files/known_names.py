@@ -34,6 +34,9 @@ BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
 """Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`."""
+Changes = Literal["midway", "drawn"]
+CHANGES: tuple[Changes, ...] = get_args(Changes)
+"""When the states of a log of looks change; see `parkenv.world.occupancy.recorded`."""
 SAME_SLOTS = "same"
 """Mapping of a log whose slots have the names of the lot's, or of counts by the names of its facilities or zones."""
 OBSERVED, UNOBSERVED = "observed", "unobserved"

@@ -287,7 +287,9 @@ def _recorded(
         told = f"{without:,} of {mapped.size:,} slots of the lot have no record"
         warnings.warn(f"{log.source}: {told}: they follow the forecast of the others", stacklevel=2)
     days = spec.replay_from, spec.forecast_from or "others"
-    return RecordedOccupancy(log, lot.walk_m(goal), mapped, *days, lot.facility_of_slot)
+    return RecordedOccupancy(
+        log, lot.walk_m(goal), mapped, *days, lot.facility_of_slot, spec.changes or "midway"
+    )
 
 
 def _counted(occupancy: OccupancySpec, spec: CountsSpec, lot: ParkingLot, goal: int) -> OccupancyModel:

@@ -34,6 +34,7 @@ from parkenv.files.known_names import (
     SAME_SLOTS,
     SCENARIO_NAMES,
     SENSOR_MODELS,
+    Changes,
     ForecastFrom,
     PackagedLot,
     RigName,
@@ -320,6 +321,13 @@ class OccupancySpec(Spec):
         panel="World",
         default="the log's fullest slots are nearest to the goal",
     )
+    changes: Changes | None = option(
+        None,
+        "When a state changes between two looks of a recorded log: midway, for all slots at once; drawn: each at its "
+        "own moment, by the forecast's law given both looks.",
+        panel="World",
+        default="midway",
+    )
     event: Event | None = None
     day_error: Annotated[DayError, BeforeValidator(_day_error_tables), OrText("number")] | None = option(
         None,
@@ -360,6 +368,7 @@ class OccupancySpec(Spec):
                 "forecast_from rolling or past together with counts and replay_from",
             ),
             (self.forecast_from not in (None, "others") and not dated, "forecast_from only with replay_from"),
+            (self.changes and not self.log, "changes only together with a log"),
             (self.event and recorded, "event only without a log or counts, whose days have their events"),
         ):
             if fault:

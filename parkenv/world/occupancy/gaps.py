@@ -2,7 +2,7 @@
 
 A slot is a two-state Markov chain whose P(taken) is the forecast's, and of which an observation loses its value at the
 forecast's decay rate. Where the state is unknown it is drawn from this chain, given what is known before and after
-(forward filtering, backward sampling, in steps of `STEP_S`).
+(forward filtering, backward sampling, in steps of `STEP_S`). So are, on demand, all states between two looks.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.week import DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
 
 STEP_S = 300.0
+LOOK_STEP_S = 60.0  # between two looks
 _LEAST = 1e-6  # of a chance: none is impossible
 
 
@@ -65,12 +66,40 @@ def day_states(
     return DayStates(np.searchsorted(slot, np.arange(n + 1)), from_s, taken)
 
 
-def _known(log: OccupancyLog, record: IntArray) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-    """Return spans of known states, by slot and time: slot, begin and end, s of the day, state."""
+def states_between_looks(
+    log: OccupancyLog,
+    record: IntArray,
+    log_odds: FloatArray,
+    decay_rate: FloatArray,
+    rng: np.random.Generator,
+) -> DayStates:
+    """As `day_states`, of a log of looks: each holds at its moment alone, and changes come at moments of their own.
+
+    So cars also come and leave between two looks without a trace. Moments are uniform in steps of `LOOK_STEP_S`.
+    """
+    grid = np.arange(0.0, DAY_S, LOOK_STEP_S)
+    slot, k = _observations(log, record)
+    state = np.full((record.size, grid.size), -1, np.int8)
+    state[slot, np.minimum(np.round(log.second[k] / LOOK_STEP_S).astype(np.int64), grid.size - 1)] = (
+        log.occupied[k]
+    )
+    taken = _drawn(state, log_odds, decay_rate, grid, rng)
+    slot, at = np.nonzero(np.diff(taken, axis=1, prepend=~taken[:, :1]))
+    from_s = np.where(at > 0, (at - rng.random(at.size)) * LOOK_STEP_S, 0.0)
+    return DayStates(np.searchsorted(slot, np.arange(record.size + 1)), from_s, taken[slot, at])
+
+
+def _observations(log: OccupancyLog, record: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the observations of the records, by slot and time: slot, index in the log."""
     first = np.where(record < 0, 0, log.first[record])
     n = np.where(record < 0, 0, log.first[record + 1] - first)
     slot = np.repeat(np.arange(record.size), n)
-    k = np.arange(slot.size) + np.repeat(first - np.cumsum(n) + n, n)
+    return slot, np.arange(slot.size) + np.repeat(first - np.cumsum(n) + n, n)
+
+
+def _known(log: OccupancyLog, record: IntArray) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+    """Return spans of known states, by slot and time: slot, begin and end, s of the day, state."""
+    slot, k = _observations(log, record)
     begin, end = log.second[k], log.until[k]
     if not log.continuous and k.size:
         same = np.diff(slot) == 0
@@ -95,7 +124,7 @@ def _drawn(
     period = np.clip(grid / PERIOD_S - 0.5, 0.0, DAY_PERIODS - 1.0)
     low = np.minimum(period.astype(np.int64), DAY_PERIODS - 2)
     p = expit(log_odds[:, low] + (period - low) * (log_odds[:, low + 1] - log_odds[:, low]))
-    left = np.exp(-decay_rate[(grid // HOUR_S).astype(np.int64)] * STEP_S)
+    left = np.exp(-decay_rate[(grid // HOUR_S).astype(np.int64)] * (grid[1] - grid[0]))
     # P(taken one step later), of a slot that is free and of one that is taken.
     if_free, if_taken = (
         np.clip(p[:, 1:] + (now - p[:, :-1]) * left[:-1], _LEAST, 1 - _LEAST) for now in (0.0, 1.0)

@@ -162,11 +162,8 @@ def find_end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, 
     if kind == PROCESS_KIND:
         find_sojourn_end(process_at(model, 0), world, slot, cursor)
         return float(cursor.valid_until)
-    end = time
-    while cursor.occupied and cursor.valid_until < np.inf:
-        end = cursor.valid_until
-        recorded_state(recorded_day_at(model, 0), slot, cursor, end + 1e-3)
-    return float(np.inf if cursor.occupied else end)
+    day = recorded_day_at(model, 0)
+    return float(recorded_next_free(day, slot, time - day.midnight) + day.midnight)
 
 
 @inlined
@@ -458,6 +455,16 @@ def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
     cursor.occupied = uint8s(day.occupied)[k] != 0
     cursor.valid_until = np.inf if last else float64s(day.from_s)[k + 1] + day.midnight - _MOMENT_S
     return bool(cursor.occupied)
+
+
+@kernel
+def recorded_next_free(day: Any, slot: int, second: float) -> float:
+    """Return the first second from then on at which a slot is free, infinite if never."""
+    k, end, free_from = recorded_index(day, slot, second), int64s(day.first)[slot + 1], second
+    while k < end and uint8s(day.occupied)[k] != 0:
+        k += 1
+        free_from = float64s(day.from_s)[k] if k < end else np.inf
+    return float(free_from)
 
 
 @kernel

@@ -16,16 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.compiled.memory import address_of, float64s, int64s, uint8s
+from parkenv.compiled.memory import address_of, uint8s
 from parkenv.errors import InputError, require, require_one_of
 from parkenv.files.field_types import as_array
-from parkenv.files.known_names import FORECAST_FROM, SAME_SLOTS, ForecastFrom
+from parkenv.files.known_names import CHANGES, FORECAST_FROM, SAME_SLOTS, Changes, ForecastFrom
 from parkenv.files.limited_reading import csv_rows
 from parkenv.forecast.slot_days import MAX_DAYS, fit_slot_days
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError
 from parkenv.world.occupancy.fit import fit_hourly_decay_rates
-from parkenv.world.occupancy.gaps import DayStates, day_states
+from parkenv.world.occupancy.gaps import DayStates, day_states, states_between_looks
 from parkenv.world.occupancy.kernel import (
     LOG_KIND,
     MAX_PROBABILITY,
@@ -37,6 +37,7 @@ from parkenv.world.occupancy.kernel import (
     recorded_day_level,
     recorded_forecast,
     recorded_index,
+    recorded_next_free,
 )
 from parkenv.world.occupancy.log import OccupancyLog, day_class, weekday_of
 from parkenv.world.occupancy.process import (
@@ -114,12 +115,9 @@ def _query(
     """
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
-        k, end = recorded_index(day, slots[i], second), int64s(day.first)[slots[i] + 1]
-        occupied[i], free_from[i] = uint8s(day.occupied)[k] != 0, second
+        occupied[i] = uint8s(day.occupied)[recorded_index(day, slots[i], second)] != 0
+        free_from[i] = recorded_next_free(day, slots[i], second)
         changes[i] = recorded_changes(day, slots[i], second)
-        while k < end and uint8s(day.occupied)[k] != 0:
-            k += 1
-            free_from[i] = float64s(day.from_s)[k] if k < end else np.inf
 
 
 @kernel
@@ -204,6 +202,8 @@ class RecordedOccupancy(OccupancyModel):
             that the world does not replay; `rolling`, those before the earliest that the world replays; `past`, those
             before `replay_from`. The last two need a `replay_from`.
         group: (n,) int64, group of each slot, such as its facility; one by default.
+        changes: when a state changes between two looks at a slot, of a log of looks: `midway`, for all slots of a
+            round at once; `drawn`, each at its own moment, from the forecast's law given both looks.
     """
 
     kind: ClassVar[int] = LOG_KIND
@@ -215,6 +215,7 @@ class RecordedOccupancy(OccupancyModel):
     replay_from: date | None = None
     forecast_from: ForecastFrom = "others"
     group: IntArray | None = None
+    changes: Changes = "midway"
     _mapped_logs: dict[int, MappedLog] = field(init=False, repr=False, default_factory=dict)
     _forecasts: dict[int, ReplayForecast] = field(init=False, repr=False, default_factory=dict)
     _states: dict[int, DayStates] = field(init=False, repr=False, default_factory=dict)
@@ -230,6 +231,7 @@ class RecordedOccupancy(OccupancyModel):
                 raise InputError(f"mapping: want ({self.n_slots},) indices of log slots from -1 to {m - 1}")
             object.__setattr__(self, "mapping", mapping)
         require_one_of("forecast_from", self.forecast_from, FORECAST_FROM)
+        require_one_of("changes", self.changes, CHANGES)
         if self.replay_from is None and self.forecast_from != "others":
             raise InputError(f"forecast_from is {self.forecast_from!r}, want replay_from with it")
 
@@ -344,7 +346,9 @@ class RecordedOccupancy(OccupancyModel):
         if index not in self._states:
             forecast, rng = self.day_forecast(day), np.random.default_rng(date.fromisoformat(day).toordinal())
             law = forecast.log_odds, forecast.decay_rate
-            self._states[index] = day_states(self.log, self.mapped_log(day).record, *law, rng)
+            drawn = self.changes == "drawn" and not self.log.continuous
+            states = states_between_looks if drawn else day_states
+            self._states[index] = states(self.log, self.mapped_log(day).record, *law, rng)
         return self._states[index]
 
     def day_forecast(self, day: str) -> ReplayForecast:
