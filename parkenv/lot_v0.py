@@ -220,8 +220,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
     - `leave_full_lot`: whether a car that knows every slot to be taken gives up at once; otherwise at the end of its
       patience.
     - `manoeuvre_s`: above 0, cars that park, leave or stand still block their lane, and queues form.
-    - `leaving_soon_s`: above 0, cars signal for that time that they are about to leave, in a further key of the
-      observation, `leaving`; a car that waits at such a slot holds it.
+    - `cues`, a field of the scenario: cars show that they are about to leave; one that waits at such a slot holds it.
     - `sees_cars`: whether observations have the key `cars`: the other cars in view. `parkenv.engine.fleet.Fleet`
       describes these options.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`.

@@ -13,7 +13,10 @@ from parkenv import InputError, OccupancyProcess, lot_v0
 from parkenv.belief.cue_belief import freed
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.envs.local_observation import LocalObservation
-from parkenv.world.cues import Cues
+from parkenv.world.cues import MOVING_S, Cues
+from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.occupancy.process import Arrival
+from parkenv.world.occupancy.recorded import RecordedOccupancy
 from planners import make_agent
 
 N_SEARCHES = 120
@@ -60,6 +63,33 @@ def test_p_free_after_a_cue_is_that_of_the_chain(p, decay_rate):
             assert without + freed(about - usual, rate, decay_rate, t) == pytest.approx(free, abs=1e-6)
 
 
+def test_drawn_changes_agree_with_all_looks_and_are_not_at_once():
+    rng, day = np.random.default_rng(0), "2024-01-01"
+    second = np.tile(np.arange(8 * 3600.0, 18 * 3600.0, 1800.0), 50)
+    slot = np.repeat(np.arange(50), 20)
+    taken = rng.random(slot.size) < 0.7
+    days = np.repeat([0, 1], slot.size)
+    log = OccupancyLog(
+        tuple(map(str, range(50))),
+        (day, "2024-01-02"),
+        np.tile(slot, 2),
+        days,
+        np.tile(second, 2),
+        np.tile(taken, 2),
+    )
+    changes = {}
+    for kind in ("midway", "drawn"):
+        model = RecordedOccupancy(log, np.arange(50.0), np.arange(50), changes=kind)
+        world = model.world(0, Arrival(7.5 * 3600.0, day))
+        for time in np.unique(second):
+            assert (world.occupied(np.arange(50), time) == taken[second == time]).all()
+        states = model.day_states(day)
+        within = (states.from_s > 8 * 3600.0) & (states.from_s < 17 * 3600.0)
+        changes[kind] = np.unique(states.from_s[within]).size / within.sum()
+    assert changes["midway"] < 0.1
+    assert changes["drawn"] > 0.9
+
+
 def test_a_perfect_cue_shows_nearly_all_that_leave_and_nothing_else():
     scenario, to_leave, others = busy(Cues()), [], []
     n = scenario.lot.n_slots
@@ -97,7 +127,7 @@ def test_the_belief_after_cues_is_calibrated(cues):
 
 
 def test_without_cues_all_is_as_before_and_with_them_the_world_is_the_same():
-    plain, cued = busy(), busy(Cues())
+    plain, cued = busy(), busy(Cues(moving_s=0.0))
     space = gym.make("parkenv/Search-v2", scenario=plain).observation_space
     assert "cues" not in space.spaces
     for seed in range(5):
@@ -110,6 +140,23 @@ def test_without_cues_all_is_as_before_and_with_them_the_world_is_the_same():
             for scenario in (plain, cued)
         ]
         assert totals[0] == totals[1]
+
+
+def test_a_car_that_moves_out_is_in_the_way_until_it_is_out():
+    scenario = busy(Cues(lead_s=60.0), stay_s=100.0)
+    edges, before, waits = scenario.edges, (None, 0, 0.0), 0
+    for _, state in wandering(scenario):
+        key, vertex, time = before
+        before = state.key, state.vertex, state.time
+        if key == state.key and vertex != state.vertex:
+            drive_s = edges["seconds"][vertex][edges["target"][vertex] == state.vertex].min()
+            wait_s = state.time - time - drive_s
+            assert -1e-6 < wait_s <= MOVING_S
+            if wait_s > 1e-6:
+                waits += 1
+                assert state.world.occupied([state.vertex], state.time - 0.01)
+                assert not state.world.occupied([state.vertex], state.time + 1e-6)
+    assert waits > 3
 
 
 def test_single_batched_local_and_copied_searches_observe_the_same():

@@ -144,7 +144,6 @@ some_options = st.fixed_dictionaries(
         "delay_s": st.sampled_from([5.0, 600.0]),
         "leave_full_lot": st.just(False),
         "manoeuvre_s": st.sampled_from([3.0, 40.0]),
-        "leaving_soon_s": st.sampled_from([2.0, 30.0]),
         "sees_cars": st.just(True),
     },
 )

@@ -144,7 +144,7 @@ def test_an_experiment_without_bounds_is_refused():
 
 def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
     crowded = experiment(arrivals_per_hour=(60.0,), knows=("own",), days=1)
-    for name, value in (("leaving_soon_s", 20.0), ("manoeuvre_s", 12.0), ("sees_cars", True)):
+    for name, value in (("manoeuvre_s", 12.0), ("sees_cars", True)):
         changed = crowded.changed(**{name: value})
         assert changed.settings() != crowded.settings()
         assert getattr(changed.fleet(changed.fleet_settings[0])[0].options, name) == value

@@ -8,6 +8,7 @@ from parkenv import OccupancyProcess, Scenario, SensorModel
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.records import SEARCHING
 from parkenv.lots import grid_lot
+from parkenv.world.cues import Cues
 from parkenv.world.demand import ConstantTime, Demand, Headways, ListedArrivals
 from parkenv.world.lot import PARK
 from planners.heuristics import POLICIES
@@ -80,42 +81,15 @@ def test_queues_grow_backwards_and_dissolve():
 def test_the_car_that_waits_for_one_that_leaves_has_the_slot():
     slot = int(by_distance()[2])
     states = {}
-    for soon_s in (0.0, 15.0):
+    for cues in (None, Cues(lead_s=1e6, moving_s=0.0)):
         # The first leaves while the second stands in a failed attempt; the third comes by in between.
         demand = Demand(ListedArrivals((36000.0, 36040.0, 36049.0)), ConstantTime(46.0))
-        fleet = Fleet(SCENARIO, demand, background="none", leaving_soon_s=soon_s)
+        fleet = Fleet(SCENARIO.replace(cues=cues), demand, background="none")
         drive(fleet, [slot] * 3)
-        states[soon_s] = np.argsort(fleet.cars["ended_at"]).tolist()
+        states[cues is None] = np.argsort(fleet.cars["ended_at"]).tolist()
         assert (fleet.slots["held_by"] == -1).all()
-    assert states[0.0] == [0, 2, 1]
-    assert states[15.0] == [0, 1, 2]
-
-
-def test_lights_are_seen_in_view_only_and_before_the_departure_only():
-    slot, beside = by_distance()[[2, 3]]
-    demand = arriving(0.0, 20.0, stay_s=100.0)
-    fleet = Fleet(SCENARIO, demand, background="none", leaving_soon_s=12.0)
-    fleet.reset(0)
-    leaves_at = None
-    seen = []
-    while (car := fleet.next_decision()) is not None and fleet.time < fleet.begin + 140.0:
-        observation = fleet.observation(car)
-        vertex = int(observation["vertex"])
-        assert fleet.observation_space.contains(observation)
-        if car == 0:
-            fleet.act(toward(slot, vertex))
-            leaves_at = fleet.time + 100.0
-            continue
-        lit = np.flatnonzero(observation["leaving"]).tolist()
-        in_view = slot in SCENARIO.in_view(vertex)
-        expected = in_view and 0 < leaves_at - fleet.time <= 12.0
-        assert lit == ([slot] if expected else [])
-        seen.append(expected)
-        # Drive to the slot beside it, and wait there by actions that the graph does not have.
-        missing = np.flatnonzero(observation["action_mask"][:4] == 0)
-        fleet.act(missing[0] if vertex == beside else ROUTES.move_toward(vertex, int(beside)))
-    assert any(seen)
-    assert not all(seen)
+    assert states[True] == [0, 2, 1]
+    assert states[False] == [0, 1, 2]
 
 
 def test_cars_see_others_in_view_and_where_one_stands():

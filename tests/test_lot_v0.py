@@ -18,6 +18,7 @@ from pettingzoo.test import (
 from parkenv import InputError, OccupancyProcess, Scenario, lot_v0
 from parkenv.lots import grid_lot
 from parkenv.world.cost_terms import REWARD_TERMS
+from parkenv.world.cues import Cues
 from parkenv.world.demand import ConstantTime, Demand, ListedArrivals
 from planners.agent import make_agent
 
@@ -28,7 +29,7 @@ pytestmark = [
 ]
 
 
-ALL = {"knows": "full", "sees_cars": True, "leaving_soon_s": 10.0, "manoeuvre_s": 5.0}
+ALL = {"knows": "full", "sees_cars": True, "cues": Cues(), "manoeuvre_s": 5.0}
 
 
 @pytest.mark.parametrize("options", [{}, ALL])

@@ -49,6 +49,7 @@ from parkenv.engine.kernel import (
     enter,
     give_up,
     init_prior,
+    is_about_to_leave,
     observe,
     publish_count,
     sum_of_costs,
@@ -93,7 +94,6 @@ from parkenv.engine.search_belief import (
     column_of,
     empty_shared_slots,
     is_taken,
-    leaves_soon,
     refresh_belief,
     set_belief_of,
 )
@@ -692,11 +692,11 @@ def blocked_until(fleet: Any, car: Any, number: int) -> float:
 
 @inlined
 def hold_slot(fleet: Any, car: Any, number: int) -> None:
-    """Let a standing car hold the slot before it if the car in it shows that it leaves, and nobody else holds it."""
-    slot = car.vertex
-    if fleet.leaving_soon_s > 0.0 and slot < fleet.n_slots:
+    """Let a standing car hold the slot before it if the car in it is about to leave, and nobody else holds it."""
+    slot, search = car.vertex, search_at(car.search, 0)
+    if scenario_at(search.scenario, 0).lead_s > 0.0 and slot < fleet.n_slots:
         shared = shared_slot_at(fleet.slots, slot)
-        if shared.held_by == NO_CAR and leaves_soon(fleet, slot, fleet.time, fleet.leaving_soon_s):
+        if shared.held_by == NO_CAR and is_about_to_leave(search, column_of(search, slot), fleet.time):
             shared.held_by, car.holds = number, slot
 
 

@@ -56,15 +56,15 @@ class Fleet(FleetMemory):
 
     Cars pass through each other, unless `manoeuvre_s` is above 0. Then a car that parks, or leaves its slot, blocks the
     lane before it for that time, and a car that stands there blocks it, too; cars that reach it wait in a queue, which
-    may grow back to the entry. (Residents leave without blocking.) With `leaving_soon_s` above 0, cars of the fleet and
-    residents signal for that time that they are about to leave; a car that stands at such a slot, in a failed attempt
-    or a wait, holds it until it drives on: attempts of other cars fail. A car observes lights and other cars within
-    the view range of its sensor, in further keys of the observation:
+    may grow back to the entry. (Residents leave without blocking.) In a scenario with `cues`, a car that stands at a
+    slot whose car is about to leave, in a failed attempt or a wait, holds it until it drives on: attempts of other
+    cars fail. A car observes cues and other cars within the view range of its sensor, in further keys of the
+    observation:
 
     | Key | Space | Meaning | with |
     |-----|-------|---------|------|
     | `reserved` | `Box(-1, 1, (n_slots,), int8)` | 1: reserved for this car; -1: it knows of none | `reserve` |
-    | `leaving` | `Box(0, 1, (n_slots,), int8)` | slots in view whose cars leave soon | `leaving_soon_s` |
+    | `cues` | `Box((2 * n_slots,), float32)` | as in `parkenv/Search-v2` | `scenario.cues` |
     | `cars` | `Box(0, 127, (2, n_vertices), int8)` | other cars in view at each vertex; standing | `sees_cars` |
     | `driver` | `Box(0, inf, (6,), float64)` | its `Drivers`, stay first, and the factor of its walk | rules of zones |
 

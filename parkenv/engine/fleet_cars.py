@@ -26,7 +26,7 @@ _TAKEN_BEFORE = 0.8
 """Chance that a free slot was taken when a car came that is parked at first: it stands in the first slot that was not.
 A counted facility that has room had room."""
 _MOST_PASSED = 30
-TIMES = ("tick_s", "delay_s", "manoeuvre_s", "leaving_soon_s")
+TIMES = ("tick_s", "delay_s", "manoeuvre_s")
 """Options that are times, s, and fields of the FLEET record."""
 
 
@@ -73,7 +73,6 @@ class FleetOptions(Validated):
         tick_s: durations of steps, and arrivals, are rounded up to multiples of this, s; 0: continuous time.
         delay_s: time after which a report is on the live map, s.
         manoeuvre_s: time for which a car that parks or leaves blocks its lane, s; 0: no car blocks a lane.
-        leaving_soon_s: time for which cars signal that they are about to leave, s.
         sees_cars: whether observations hold the other cars in view.
 
     Raises:
@@ -87,7 +86,6 @@ class FleetOptions(Validated):
     tick_s: NotNegative = 0.0
     delay_s: NotNegative = 0.0
     manoeuvre_s: NotNegative = 0.0
-    leaving_soon_s: NotNegative = 0.0
     sees_cars: bool = False
 
     def __post_init__(self) -> None:

@@ -230,8 +230,6 @@ class FleetMemory:
         further: dict[str, spaces.Space[Any]] = {}
         if self._is_guided:
             further["reserved"] = spaces.Box(-1, 1, (lot.n_slots,), np.int8)
-        if self.options.leaving_soon_s > 0.0:
-            further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
         if self.scenarios[0].has_rules:
             further["driver"] = spaces.Box(0.0, np.inf, (6,), np.float64)
         if self.options.sees_cars:
@@ -257,8 +255,6 @@ class FleetMemory:
             reserved = self.search_of(address)["reserved"]
             own = np.arange(len(self.slots)) == reserved
             observation["reserved"] = own.astype(np.int8) - np.int8(reserved == UNGUIDED)
-        if self.options.leaving_soon_s > 0.0:
-            observation["leaving"] = self._leaving_in_view(int(vertex))
         if self.scenarios[0].has_rules:
             driver = *self.drawn.drivers_of(car), self.cars["walks"][car]
             observation["driver"] = np.array(driver, np.float64)
@@ -297,13 +293,6 @@ class FleetMemory:
         if mask[PARK] and self.drawn.zone_cost_s is not None:
             mask[PARK] = np.isfinite(self.drawn.zone_cost_s[car, self.scenarios[0].lot.zone_of_slot[vertex]])
         return mask
-
-    def _leaving_in_view(self, vertex: int) -> NDArray[np.int8]:
-        slots = self.slots
-        leaving, viewed = np.zeros(len(slots), np.int8), self.scenarios[0].in_view(vertex)
-        left_s = slots["leaves_at"][viewed] - self.record["time"]
-        leaving[viewed] = (left_s > 0.0) & (left_s <= self.options.leaving_soon_s)
-        return leaving
 
     def _cars_in_view(self, car: int, vertex: int) -> NDArray[np.int8]:
         cars, lot = self.cars, self.scenarios[0].lot

@@ -20,12 +20,10 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
     CUE_STREAM,
     ENTRY_STREAM,
-    LEAD_STREAM,
     OBSERVATION_STREAM,
     SCENARIO_STREAM,
     VIEW_STREAM,
     episode_key,
-    keyed_exponential,
     keyed_uniform,
 )
 from parkenv.compiled.memory import float32s, float64s, int32s, int64s
@@ -375,6 +373,8 @@ def drive_or_park(search: Any, action: int) -> None:
     target = edge.target
     if target != vertex:
         search.previous_vertex, search.vertex = vertex, target
+        if scenario.moving_s > 0.0:
+            search.step_drive_s += in_the_way_s(search, search.time + edge.seconds)
     elif action == PARK and vertex < scenario.n_slots:
         column = column_of(search, vertex)
         taken = is_taken(search, column, search.time)
@@ -549,22 +549,36 @@ def observe_cues(search: Any) -> None:
             float32s(search.cues)[slot] = excess
 
 
-@kernel
+@inlined
 def is_about_to_leave(search: Any, column: int, time: float) -> bool:
-    """Return whether the car in a slot shows that it leaves, from a time that hangs on the slot and its departure."""
-    scenario, record = scenario_at(search.scenario, 0), slot_at(search.slots, column)
+    return bool(leaves_in_s(search, column, time) < np.inf)
+
+
+@kernel
+def leaves_in_s(search: Any, column: int, time: float) -> float:
+    """Return how soon the car in a slot leaves, s, if it shows that it does; else infinity."""
+    scenario, slot = scenario_at(search.scenario, 0), np.int64(slot_at(search.slots, column).slot)
     if not is_taken(search, column, time):
-        return False
-    shared, key = scenario.world_kind == SHARED_KIND, search.key
-    if shared:
+        return np.inf
+    key = search.key
+    if scenario.world_kind == SHARED_KIND:
         key = shared_world_at(search.world, 0).key
     end = end_of_stay(search, column, time)
-    if end == np.inf:
-        return False
-    lead = scenario.lead_s * keyed_exponential(
-        key, LEAD_STREAM, np.int64(record.slot), np.int64(end * 1000.0)
-    )
-    return bool(end - time <= lead)
+    left = end - time
+    return float(left if left <= worlds.shown_s(key, slot, end, scenario.lead_s) else np.inf)
+
+
+@kernel
+def in_the_way_s(search: Any, time: float) -> float:
+    """Return for how long the car that moves out of the slot at the new vertex is in the way, s."""
+    scenario = scenario_at(search.scenario, 0)
+    if search.vertex >= scenario.n_slots or scenario.world_kind == SHARED_KIND:
+        return 0.0  # In fleets manoeuvres block lanes.
+    column = column_of(search, search.vertex)
+    left, record = leaves_in_s(search, column, time), slot_at(search.slots, column)
+    # Its state is still to be observed: `observe_exact` takes a valid one for observed.
+    record.valid_until, record.end_known = -np.inf, False
+    return float(left if left <= scenario.moving_s else 0.0)
 
 
 @kernel

@@ -62,6 +62,7 @@ PROBLEM_FIELDS: tuple[tuple[str, Any, Value], ...] = (
     ("false_alarm_rate", [np.float64], lambda problem: problem.sensor_rates.false_alarm),
     # Cues of departures: mean time, s, 0 without any; P(cue | about to leave); P(cue | not).
     ("lead_s", np.float64, lambda problem: getattr(problem.cues, "lead_s", 0.0)),
+    ("moving_s", np.float64, lambda problem: getattr(problem.cues, "moving_s", 0.0)),
     ("cue_hit_rate", np.float64, lambda problem: getattr(problem.cues, "hit_rate", 0.0)),
     ("cue_false_alarm_rate", np.float64, lambda problem: getattr(problem.cues, "false_alarm_rate", 0.0)),
 )
@@ -400,7 +401,6 @@ FLEET = np.dtype(
         ("n_vertices", np.int64),
         ("blocked_until", ADDRESS),  # (n_vertices,) float64
         ("blocked_by", ADDRESS),  # (n_vertices,) int64, which car
-        ("leaving_soon_s", np.float64),  # for how long before they leave cars show it
         ("live_map", ADDRESS),  # (n_slots,) LIVE_SLOT
         ("delay_s", np.float64),  # of the live map
         ("reports", ADDRESS),  # a ring of REPORT records that are not on the live map yet

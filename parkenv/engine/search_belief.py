@@ -343,12 +343,6 @@ def is_slot_open(address: int, slot: int, car: int, time: float) -> bool:
 
 
 @inlined
-def leaves_soon(world: Any, slot: int, time: float, soon_s: float) -> bool:
-    leaves_at = shared_slot_at(world.slots, slot).leaves_at
-    return bool(time < leaves_at <= time + soon_s)
-
-
-@inlined
 def _background_state(world: Any, slot: int, shared: Any, time: float) -> bool:
     if time >= shared.valid_until:
         cursor = worlds.cursor_of(shared)

@@ -32,7 +32,6 @@ from parkenv.scenarios.spec import (
     ZoneSpec,
     scenario_specs,
 )
-from parkenv.world.cues import Cues
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import ConstantForecast, OccupancyModel, OccupancyProcess, PriorModel
@@ -173,7 +172,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             arrival=window,
             demand=demand_of(spec.demand, lot, window),
             traffic=Traffic(**(spec.traffic.model_dump() if spec.traffic else {})),
-            cues=Cues(**spec.cues.model_dump()) if spec.cues else None,
+            cues=spec.cues,
             rig=spec.rig,
             detector=spec.detector,
         )

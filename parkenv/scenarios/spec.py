@@ -52,7 +52,7 @@ from parkenv.files.spec_file import (
     resolved_path,
 )
 from parkenv.files.user_class import find_module
-from parkenv.world.cues import LEAD_S
+from parkenv.world.cues import Cues
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
@@ -584,14 +584,6 @@ def _cues_table(text: str) -> dict[str, Any]:
     return dict(zip(("hit_rate", "false_alarm_rate", "lead_s"), numbers, strict=False))
 
 
-class CuesSpec(Spec):
-    """Cars that show that they are about to leave, and how well that is observed."""
-
-    lead_s: float = Field(LEAD_S, gt=0.0, le=3600.0, description="Mean time before the departure, s.")
-    hit_rate: Probability = Field(1.0, description="P(cue observed | about to leave).")
-    false_alarm_rate: Probability = Field(0.0, description="P(cue observed | not about to leave).")
-
-
 class TrafficSpec(Spec):
     """Other road users."""
 
@@ -763,7 +755,7 @@ class ScenarioSpec(Spec):
         panel="Sensors",
         default="the scenario's; with --rig, the rig's",
     )
-    cues: Annotated[CuesSpec, _from_text(_cues_table), OrText()] | None = option(
+    cues: Annotated[Cues, _from_text(_cues_table), OrText()] | None = option(
         None,
         "Cars show that they are about to leave. perfect: without error; or P(cue | about to leave) and P(cue | not) "
         "at each observation, and the mean time before the departure, s.",

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pydantic import ConfigDict
+
 from parkenv.errors import require
-from parkenv.files.field_types import Positive, Probability, Validated
+from parkenv.files.field_types import NotNegative, Positive, Probability, Validated
 
 LEAD_S = 31.0
 """Mean time from the first cue to the departure, s.
@@ -13,6 +15,10 @@ LEAD_S = 31.0
 It is the mean of 220 drivers at a mall from the open door on, while a car waited for the space; without one, 27 s
 (Ruback and Juieng, Territorial defense in parking lots, Journal of Applied Social Psychology 27, 1997).
 """
+
+
+MOVING_S = 5.0
+"""Time to move out of a slot, s: an assumption, the middle of 3 to 8."""
 
 
 @dataclass(frozen=True)
@@ -25,18 +31,23 @@ class Cues(Validated):
         lead_s: its mean, s.
         hit_rate: P(cue observed | about to leave), at each observation of the slot.
         false_alarm_rate: P(cue observed | not about to leave).
+        moving_s: for how long at most, at the end, the car moves out and is in the way of one that drives past, s; in
+            fleets, manoeuvres block lanes instead.
 
     Raises:
         InputError: a value out of its range, or uninformative cues (equal rates).
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid", strict=False)  # as a table of a scenario file
+
     lead_s: Positive = LEAD_S
     hit_rate: Probability = 1.0
     false_alarm_rate: Probability = 0.0
+    moving_s: NotNegative = MOVING_S
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require(
             self.hit_rate > self.false_alarm_rate,
-            f"cues: hit_rate is {self.hit_rate:g}, want it above false_alarm_rate, {self.false_alarm_rate:g}",
+            f"hit_rate is {self.hit_rate:g}, want it above false_alarm_rate, {self.false_alarm_rate:g}",
         )

@@ -63,7 +63,7 @@ MAX_SETTINGS = 10_000  # maximum number of settings of a study
 # Default agents: in a lot, where parking has a price, and where there are facilities.
 NEAREST, MINDS_PRICES, IN_TOWNS = "greedy-drive", "greedy-total", "usual"
 # Fields of the specification that all settings have in common.
-OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
+OPTIONS = ("stay_s", "patience_s", "delay_s", "sees_cars")
 
 
 class FleetSpec(Study):
@@ -121,15 +121,6 @@ class FleetSpec(Study):
         name="--manoeuvre",
         panel="Interactions",
         default="as in --calibrated; else 0, cars pass through each other",
-        ge=0.0,
-        le=3600.0,
-    )
-    leaving_soon_s: float = option(
-        0.0,
-        "Seconds for which cars signal that they are about to leave; a car that waits at such a "
-        "slot holds it.",
-        name="--leaving-soon",
-        panel="Interactions",
         ge=0.0,
         le=3600.0,
     )
@@ -347,7 +338,7 @@ class FleetStudy(FleetSpec):
         parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
         parkenv fleet --scenario old.geojson,new.geojson --hours 08:00-12:00 --report
         parkenv fleet --lot zones.geojson --price centre=2/h --value-of-time 12/h
-        parkenv fleet --manoeuvre 15 --leaving-soon 10
+        parkenv fleet --manoeuvre 15 --cues perfect
         parkenv fleet --resume --episodes 20
         """
 

@@ -19,6 +19,7 @@ from parkenv.compiled.jit import compiled
 from parkenv.compiled.keyed_random import (
     ARRIVAL_STREAM,
     DAY_STREAM,
+    LEAD_STREAM,
     OCCUPANCY_STREAM,
     keyed_exponential,
     keyed_uniform,
@@ -164,6 +165,12 @@ def find_end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, 
         return float(cursor.valid_until)
     day = recorded_day_at(model, 0)
     return float(recorded_next_free(day, slot, time - day.midnight) + day.midnight)
+
+
+@inlined
+def shown_s(key: np.uint64, slot: int, end: float, lead_s: float) -> float:
+    """Return for how long before the end of its stay a car shows that it leaves, s (see `parkenv.world.cues`)."""
+    return float(lead_s * keyed_exponential(key, LEAD_STREAM, slot, np.int64(end * 1000.0)))
 
 
 @inlined
