@@ -200,6 +200,17 @@ def apply_observations_at(
 
 
 @kernel
+def apply_cues_at(address: int, slots: IntArray, hit_rate: FloatArray, false_alarm_rate: FloatArray) -> None:
+    """Update the belief in cars about to leave, from what was seen of slots that have just been observed.
+
+    The rates, (k,) contiguous each, are P(what was seen | about to leave) and P(it | not), up to a common factor.
+    """
+    search = search_at(address, 0)
+    for i in range(slots.size):
+        apply_cue(search, column_of(search, slots[i]), True, hit_rate[i], false_alarm_rate[i])
+
+
+@kernel
 def set_taken_at(address: int, slot: int) -> None:
     search = search_at(address, 0)
     set_belief(search, column_of(search, slot), True, 1.0)
@@ -516,37 +527,39 @@ def observe_cues(search: Any) -> None:
     for i in range(starts[search.vertex], starts[search.vertex + 1]):
         slot = viewed[i]
         column = np.int64(int32s(search.columns)[slot])
-        record, k = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
         block = block_at(search.blocks, column >> BLOCK_BITS)
-        if column == SENTINEL or block.observed_at[k] != time:
+        if column == SENTINEL or block.observed_at[column & (BLOCK_SIZE - 1)] != time:
             continue
-        cue, p, prior, decay_rate = (
-            cue_at(search.cue_table, column), block.p_observed[k], block.prior[k], block.decay_rate[k]
-        )  # fmt: skip
-        rate = leaving_rate(search, prior, decay_rate)
-        usual, before, excess = decay_rate * (1.0 - prior) / rate, 0.0, 0.0
-        if record.observed_taken:
-            if cue.excess != 0.0 and cue.at < time:
-                # What the earlier cue has left, of the cars that were still expected to be there
-                gap = time - cue.at
-                there = decay_to_prior(prior, decay_rate, cue.p, gap) - freed(
-                    cue.excess, rate, decay_rate, gap
-                )
-                before = cue.excess * math.exp(-rate * gap) * p / max(there, _LEAST_P)
-            elif cue.at == time:
-                before = cue.excess
-            about_to = min(max(usual * p + before, 0.0), p)
-            seen = keyed_uniform(search.key, CUE_STREAM, slot, millisecond) < (
-                scenario.cue_hit_rate
-                if is_about_to_leave(search, column, time)
-                else scenario.cue_false_alarm_rate
-            )
-            excess = (
-                bayes_update(about_to, seen, scenario.cue_hit_rate, scenario.cue_false_alarm_rate) - usual * p
-            )
-        cue.excess, cue.at, cue.p = excess, time, p
-        if search.cues != 0:
-            float32s(search.cues)[slot] = excess
+        hit, false_alarm, seen = scenario.cue_hit_rate, scenario.cue_false_alarm_rate, False
+        if slot_at(search.slots, column).observed_taken:
+            rate = hit if is_about_to_leave(search, column, time) else false_alarm
+            seen = keyed_uniform(search.key, CUE_STREAM, slot, millisecond) < rate
+        apply_cue(search, column, seen, hit, false_alarm)
+
+
+@kernel
+def apply_cue(search: Any, column: int, seen: bool, hit_rate: float, false_alarm_rate: float) -> None:
+    """Update the belief that a car is about to leave, whose slot has just been observed, whether a cue was seen."""
+    record, k, time = slot_at(search.slots, column), column & (BLOCK_SIZE - 1), search.time
+    block = block_at(search.blocks, column >> BLOCK_BITS)
+    cue, p, prior, decay_rate = (
+        cue_at(search.cue_table, column), block.p_observed[k], block.prior[k], block.decay_rate[k]
+    )  # fmt: skip
+    rate = leaving_rate(search, prior, decay_rate)
+    usual, before, excess = decay_rate * (1.0 - prior) / rate, 0.0, 0.0
+    if record.observed_taken:
+        if cue.excess != 0.0 and cue.at < time:
+            # What the earlier cue has left, of the cars that were still expected to be there
+            gap = time - cue.at
+            there = decay_to_prior(prior, decay_rate, cue.p, gap) - freed(cue.excess, rate, decay_rate, gap)
+            before = cue.excess * math.exp(-rate * gap) * p / max(there, _LEAST_P)
+        elif cue.at == time:
+            before = cue.excess
+        about_to = min(max(usual * p + before, 0.0), p)
+        excess = bayes_update(about_to, seen, hit_rate, false_alarm_rate) - usual * p
+    cue.excess, cue.at, cue.p = excess, time, p
+    if search.cues != 0:
+        float32s(search.cues)[record.slot] = excess
 
 
 @inlined
