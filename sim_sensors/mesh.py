@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from functools import cached_property
 from typing import NamedTuple
 
@@ -13,10 +13,21 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import Float32Array
 
 Material = IntEnum(
-    "Material", "PAINT GLASS TRIM RUBBER RIM LAMP PLATE INTERIOR CHROME FOLIAGE BARK STONE CLOTH", start=0
+    "Material",
+    "PAINT GLASS TRIM RUBBER RIM LAMP TAIL_LAMP REVERSING_LAMP HEAD_LAMP PLATE INTERIOR CHROME FOLIAGE BARK STONE "
+    "CLOTH LIT",
+    start=0,
 )
 """Materials, each with its own shading: clear-coated paint, glass, dark plastic (trim), rubber, ... the stone of kerbs
-and walls, and the cloth of pedestrians. An interior is seats and dashboard behind glass."""
+and walls, and the cloth of pedestrians. An interior is seats and dashboard behind glass. A lamp that is lit is LIT."""
+
+
+class Lamps(IntFlag):
+    """Lamps of a vehicle that are lit."""
+
+    TAIL = 1  # tail and brake lamps
+    REVERSING = 2
+    HEAD = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +81,7 @@ class Instances:
     # the static instances, which come first, if others move; their shadows are cached as long as this object exists.
     # None: nothing moves.
     still: Instances | None = None
+    lamps: NDArray[np.uint8] | None = None  # (n,) uint8, the `Lamps` of each that are lit; None: none
 
 
 @dataclass(frozen=True, eq=False)

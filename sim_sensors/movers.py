@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 
 import numpy as np
@@ -55,6 +55,12 @@ class Movers:
             self.walker_stride[walkers],
             self.walker_look[walkers],
         )
+
+    def joined(self, others: Movers | None) -> Movers:
+        """Return these and others, after them."""
+        if others is None:
+            return self
+        return Movers(*(np.concatenate([getattr(m, f.name) for m in (self, others)]) for f in fields(self)))
 
     @property
     def gait(self) -> IntArray:

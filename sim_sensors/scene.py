@@ -126,6 +126,7 @@ class Scene:
     vehicle_model: IntArray
     fleet: Fleet
     movers: Movers | None = field(default=None, init=False)
+    lamps: NDArray[np.uint8] | None = field(default=None, init=False)  # (n,) `Lamps` that are lit; None: none
 
     def __post_init__(self) -> None:
         pose = as_floats("vehicle_pose", self.vehicle_pose, None, 3)
@@ -133,10 +134,23 @@ class Scene:
         self.fleet.require_models(model)
         self._set(pose, model, self.fleet)
 
-    def _set(self, pose: FloatArray, model: IntArray, fleet: Fleet, movers: Movers | None = None) -> None:
+    def _set(
+        self,
+        pose: FloatArray,
+        model: IntArray,
+        fleet: Fleet,
+        movers: Movers | None = None,
+        lamps: NDArray[np.uint8] | None = None,
+    ) -> None:
         for array in (pose, model):
             array.setflags(write=False)
-        named = {"vehicle_pose": pose, "vehicle_model": model, "fleet": fleet, "movers": movers}
+        named = {
+            "vehicle_pose": pose,
+            "vehicle_model": model,
+            "fleet": fleet,
+            "movers": movers,
+            "lamps": lamps,
+        }
         for name, value in named.items():
             object.__setattr__(self, name, value)
 
@@ -219,6 +233,7 @@ class Scene:
             np.concatenate([still.pose, pose]),
             np.concatenate([still.ids, self._mover_ids.astype(np.int32)]),
             still,
+            None if still.lamps is None else np.pad(still.lamps, (0, len(pose))),
         )
 
     @property
@@ -239,6 +254,7 @@ class Scene:
             np.concatenate([scenery.mesh, mesh]),
             np.concatenate([scenery.pose, pose]),
             np.concatenate([scenery.ids, (self.present + 1).astype(np.int32)]),
+            lamps=None if self.lamps is None else np.pad(self.lamps[self.present], (len(scenery.ids), 0)),
         )
 
     def footprints(self) -> Footprints:
@@ -292,7 +308,7 @@ class Scene:
         )
 
     def with_vehicle(
-        self, i: int, *, pose: ArrayLike | None = None, model: VehicleModel | None = None
+        self, i: int, *, pose: ArrayLike | None = None, model: VehicleModel | None = None, lamps: int = 0
     ) -> Scene:
         """Return a scene with another vehicle in place i, or the same one at another pose; everything else is shared.
 
@@ -300,6 +316,7 @@ class Scene:
             i: the place.
             pose: (3,): x, y in m, yaw in rad; None: unchanged.
             model: None: unchanged. A model that is not in the fleet is added to a copy of its meshes.
+            lamps: the `Lamps` that are lit.
 
         Raises:
             SensorError: the place does not exist, the pose is not finite, or an empty place gets no model.
@@ -312,7 +329,7 @@ class Scene:
             number = fleet.models.index(model)
         if number == NO_VEHICLE:
             raise SensorError(f"model: place {i} is empty, want a model for it")
-        return self._changed(i, self.vehicle_pose[i] if pose is None else pose, number, fleet)
+        return self._changed(i, self.vehicle_pose[i] if pose is None else pose, number, fleet, lamps)
 
     def without_vehicle(self, i: int) -> Scene:
         """Return a scene in which place i is empty; everything else is shared."""
@@ -333,7 +350,7 @@ class Scene:
         if movers is not None:
             self.fleet.require_models(movers.vehicle_model)
         scene = object.__new__(Scene)
-        scene._set(self.vehicle_pose, self.vehicle_model, self.fleet, movers)
+        scene._set(self.vehicle_pose, self.vehicle_model, self.fleet, movers, self.lamps)
         scene.__dict__["still_instances"] = self.still_instances
         return scene
 
@@ -341,12 +358,15 @@ class Scene:
         if not 0 <= i < self.n_vehicles:
             raise SensorError(f"place is {i}, want 0 to {self.n_vehicles - 1}")
 
-    def _changed(self, i: int, pose: ArrayLike, number: int, fleet: Fleet) -> Scene:
-        new_pose, new_model = self.vehicle_pose.copy(), self.vehicle_model.copy()
+    def _changed(self, i: int, pose: ArrayLike, number: int, fleet: Fleet, lamps: int = 0) -> Scene:
+        new_pose, new_model, lit = self.vehicle_pose.copy(), self.vehicle_model.copy(), self.lamps
         new_pose[i] = as_floats("pose", pose, 3)
         new_model[i] = number
+        if lamps or lit is not None:
+            lit = np.zeros(self.n_vehicles, np.uint8) if lit is None else lit.copy()
+            lit[i] = lamps
         scene = object.__new__(Scene)
-        scene._set(new_pose, new_model, fleet, self.movers)
+        scene._set(new_pose, new_model, fleet, self.movers, lit)
         if "scan_plane" in self.__dict__:
             scene.__dict__["scan_plane"] = self.scan_plane.with_footprint(i, scene.footprint(i))
         return scene

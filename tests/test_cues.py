@@ -215,7 +215,7 @@ def test_what_does_not_know_cues_says_so(tmp_path):
         Cues(hit_rate=0.1, false_alarm_rate=0.1)
     with pytest.raises(InputError, match=r"cues of departures, which the model does not know"):
         parkenv.model(busy(Cues()))
-    with pytest.raises(InputError, match=r"cues of departures are not simulated for sensors"):
+    with pytest.raises(InputError, match=r"cues of departures are not perceived"):
         gym.make("parkenv/SearchPerception-v2", scenario=busy(Cues()))
     for given in ("often", "0.5", "0.5,0.1,31,9"):
         done = command("compare", "--cues", given, "--out", tmp_path / "run")

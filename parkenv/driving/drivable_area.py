@@ -116,7 +116,7 @@ class LotObstacles:
         self._boxes[:, [0, 3]] -= out[:, None]
 
     def begin(self, key: np.uint64, world: World) -> None:
-        self._scenes = LotScenes(self.slots, self._scenario, key, world)
+        self._scenes = LotScenes(self.slots, self._scenario.replace(cues=None), key, world)
 
     def taken(self, center: FloatArray, time: float) -> list[int]:
         """Return the occupied slots within `REACH_M` of a point, (2,) m, at a time, s; ascending."""

@@ -10,6 +10,7 @@ import numpy as np
 from parkenv.engine.kernel import act_at, apply_observations_at, finish_step_at
 from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.envs.sensors import SensingSearchEnv
+from parkenv.errors import require
 from parkenv.perception.detector import Detector
 from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
 from parkenv.perception.slot_filter import SlotObservation
@@ -145,6 +146,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     ) -> None:
         require_changes((type(self),), changes)
         world = make_scenario(scenario, **changes)
+        require(world.cues is None, "cues of departures are not perceived; want a scenario without them")
         sensors = make_rig(rig, world, picture_width)
         self.perception = OnboardPerception(world, sensors, weather, captures, every, detector)
         super().__init__(self.perception.scenario, render_mode, observation, k, flat, reward_scale)

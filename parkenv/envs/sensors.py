@@ -21,7 +21,7 @@ from sim_sensors.rig import SensorRig, TimedCapture
 FARTHEST = 1e7  # bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller
 
 OBSERVATIONS = ("full", "scan")
-_NOT_SENSED = ("p_occupied", "belief", "step_observed", "day_error")
+_NOT_SENSED = ("p_occupied", "belief", "step_observed", "day_error", "cues")
 
 
 class SensingSearchEnv(SearchEnv):
@@ -29,13 +29,6 @@ class SensingSearchEnv(SearchEnv):
 
     _sampler: SensorSampler
     _before: tuple[int, float] | None = None
-
-    def _make_search(self) -> None:
-        require(
-            all(scenario.cues is None for scenario in self.scenarios),
-            "cues of departures are not simulated for sensors; want a scenario without them, or parkenv/Search-v2",
-        )
-        super()._make_search()
 
     @property
     def rig(self) -> SensorRig:
@@ -178,7 +171,7 @@ road users |
         self._captures = [] if state.parked else self._sampler.sample_step(state, self._before)
         observation: dict[str, Any] = super()._observation(vertex)
         for name in _NOT_SENSED:
-            del observation[name]
+            observation.pop(name, None)
         for name, space in self.observation_space.items():
             if name not in observation:
                 observation[name] = np.zeros(space.shape, space.dtype)

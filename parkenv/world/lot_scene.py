@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.world.cue_scene import CueScene
 from parkenv.world.lot import Mouth, ParkingLot, is_building
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
@@ -71,7 +72,7 @@ def _make_slot_lot(lot: ParkingLot, seed: int) -> SlotLot:
 class LotScenes:
     """Scenes of one world, that of a key, over time.
 
-    Parked cars and traffic depend only on the world. Consecutive scenes are updated incrementally.
+    Parked cars, cues of departures and traffic depend only on the world. Consecutive scenes are updated incrementally.
     """
 
     def __init__(self, slots: SlotLot, scenario: Scenario, key: np.uint64, world: World) -> None:
@@ -79,6 +80,7 @@ class LotScenes:
         self._everything = np.arange(scenario.lot.n_slots)
         self._first_car = int(key) % CARS_APART
         self._traffic = LotTraffic(scenario.lot, scenario.goal, scenario.traffic, key, slots)
+        self._cues = None if scenario.cues is None else CueScene(scenario.lot, scenario.cues, key, world)
         self._stretch = np.empty(0, dtype=np.int64)
         self._scene: Scene | None = None
 
@@ -95,4 +97,5 @@ class LotScenes:
                 else:
                     self._scene = self._scene.without_vehicle(slot)
         self._stretch = sojourn
-        return self._scene.with_movers(self._traffic.at(time, ego))
+        scene = self._scene.with_movers(self._traffic.at(time, ego))
+        return scene if self._cues is None else self._cues.added_to(scene, time, ego)

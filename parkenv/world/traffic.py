@@ -27,8 +27,8 @@ _AXLE_M = 1.3  # from a car's middle to its axles, which follow its path
 _STEP_M = 0.3
 _EGO = np.array([2.4, 0.95])
 _GAP = np.array([1.2, 0.4])
-_HALF_CAR = np.array([2.3, 0.95])
-_HALF_PERSON = np.array([0.35, 0.3])
+HALF_CAR = np.array([2.3, 0.95])
+HALF_PERSON = np.array([0.35, 0.3])
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class LotTraffic:
         every = self.movers_at(np.full(self._n, time))
         if ego is None:
             return every
-        clear = _clear_of(ego, every.vehicle_pose, _HALF_CAR)
-        return every.only(clear, _clear_of(ego, every.walker_pose, _HALF_PERSON))
+        clear = clear_of(ego, every.vehicle_pose, HALF_CAR)
+        return every.only(clear, clear_of(ego, every.walker_pose, HALF_PERSON))
 
     def movers_at(self, times: FloatArray) -> Movers:
         from sim_sensors.movers import LOOKS, Movers
@@ -191,7 +191,7 @@ class _Routes:
         return np.asarray(self._lot.vertex_xy[vertices[::-1]]).reshape(-1, 2)
 
 
-def _clear_of(ego: FloatArray, pose: FloatArray, half: FloatArray) -> NDArray[np.bool_]:
+def clear_of(ego: FloatArray, pose: FloatArray, half: FloatArray) -> NDArray[np.bool_]:
     offset = pose[:, :2] - ego[:2]
     c, s = np.cos(ego[2]), np.sin(ego[2])
     local = np.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]], axis=1)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import FAST, LEAF
-from sim_sensors.mesh import Instances, Material, MeshArrays, MeshPool
+from sim_sensors.mesh import Instances, Lamps, Material, MeshArrays, MeshPool
 
 NEAR = 0.05  # m; nothing nearer is drawn
 
@@ -25,6 +25,12 @@ NEAR = 0.05  # m; nothing nearer is drawn
 # the windows.
 _CLOSED = np.zeros(256, dtype=np.bool_)
 _CLOSED[[Material.RUBBER, Material.BARK, Material.STONE]] = True
+
+_LIT = {  # material of each lamp, and its light, sRGB
+    Lamps.TAIL: (Material.TAIL_LAMP, (188, 24, 18)),
+    Lamps.REVERSING: (Material.REVERSING_LAMP, (255, 255, 250)),
+    Lamps.HEAD: (Material.HEAD_LAMP, (255, 252, 240)),
+}
 
 
 class ScreenTriangles(NamedTuple):
@@ -108,7 +114,16 @@ def project(
         pool.arrays, _Placed(visible, mesh, instances.pose), camera, begin, end, most_vertices, out
     )
     count = int(end[0])
-    return ScreenTriangles._make(column[:count] for column in out)
+    out = ScreenTriangles._make(column[:count] for column in out)
+    if instances.lamps is not None:
+        _light(out, instances.lamps[out.instance])
+    return out
+
+
+def _light(out: ScreenTriangles, lamps: NDArray[np.uint8]) -> None:
+    for lamp, (material, light) in _LIT.items():
+        on = (out.material == material) & (lamps & lamp != 0)
+        out.material[on], out.color[on] = Material.LIT, light
 
 
 def _visible_instances(

@@ -25,6 +25,7 @@ from sim_sensors.camera.materials import (
     color_surfaces,
     cover_with_glass,
     detail_leaves,
+    light_lamps,
     light_surfaces,
     mirror_in_surfaces,
     orient,
@@ -256,6 +257,7 @@ def _shade_surfaces(
     soil_surfaces(n, materials.response, batch, surfaces)
     light_surfaces(n, light, maps, batch, surfaces)
     mirror_in_surfaces(n, light, maps, batch, surfaces)
+    light_lamps(n, places, triangles.color, materials.linear, batch, surfaces)
     fade_into_haze(n, light, batch)
     write(n, places, batch, image)
 
