@@ -1,7 +1,7 @@
 """What sensors can see of cars that leave: somebody who walks up and gets in, lamps, a car that moves out.
 
 With E the departure and L the time from the first cue to it, somebody walks to the driver's door until E - L and gets
-in; lamps are lit from E - `LAMPS_S` on; and the car moves out in the last `MOVE_S` before E. L cuts each short. False
+in; lamps are lit from E - `LAMPS_S` on; and the car moves out at the end, for `Cues.moving_s`. L cuts each short. False
 alarms are cars that have just been backed in: their lamps are still lit.
 """
 
@@ -13,8 +13,9 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.keyed_random import LEAVING_STREAM, keyed_uniform
-from parkenv.world.cues import Cues, lead_of
+from parkenv.world.cues import Cues
 from parkenv.world.lot import Mouth, ParkingLot
+from parkenv.world.occupancy.kernel import shown_s
 from parkenv.world.occupancy.process import World
 from parkenv.world.traffic import HALF_CAR, HALF_PERSON, STRIDE_M, clear_of
 from sim_sensors.mesh import Lamps
@@ -25,7 +26,6 @@ from sim_sensors.scene import Scene
 WALK_S, WALK_SPEED = 10.0, 1.2  # of the walk to the door that can be seen, s, m/s
 DOOR_S = 5.0  # s, from the first cue until the driver is inside
 LAMPS_S = 10.0
-MOVE_S = (3.0, 8.0)  # range of the time to move out, s
 ARRIVED_S = 5.0  # for which lamps of a car that was backed in stay lit
 
 _DOOR_M = (0.3, 0.4)  # place of a driver at the door: ahead of the car's middle, from its side
@@ -37,7 +37,7 @@ class CueScene:
     """Cues of one world over time: a pure function of (key, slot, time)."""
 
     def __init__(self, lot: ParkingLot, cues: Cues, key: np.uint64, world: World) -> None:
-        self._lead_s, self._key, self._world = cues.lead_s, key, world
+        self._lead_s, self._moving_s, self._key, self._world = cues.lead_s, cues.moving_s, key, world
         self._yaw, self._left_hand = lot.slot_yaw, lot.left_hand
         self._at_kerb = lot.slot_mouth != Mouth.REAR
         way = lot.mouth_xy() - lot.slot_xy
@@ -58,7 +58,7 @@ class CueScene:
         slots, people = scene.present, []
         for slot, end in zip(slots.tolist(), self._world.next_free(slots, time).tolist(), strict=True):
             left = end - time
-            lead = lead_of(self._key, slot, end, self._lead_s) if left < math.inf else 0.0
+            lead = shown_s(self._key, slot, end, self._lead_s) if left < math.inf else 0.0
             door_s = min(DOOR_S, lead / 3.0)
             if lead - door_s < left <= lead + WALK_S:
                 people.append(self._driver(scene, slot, end, max(left - lead, 0.0)))
@@ -99,8 +99,7 @@ class CueScene:
         pose, out = scene.vehicle_pose[slot], self._out[slot]
         reverses = not self._at_kerb[slot] and math.cos(pose[2]) * out[0] + math.sin(pose[2]) * out[1] < 0.0
         lamps = Lamps.TAIL | Lamps.HEAD | (Lamps.REVERSING if reverses else Lamps(0))
-        move_s = min(lead, MOVE_S[0] + (MOVE_S[1] - MOVE_S[0]) * self._draw(slot, end, 0))
-        share = max(1.0 - left / move_s, 0.0)
+        share = max(1.0 - left / max(min(lead, self._moving_s), 1e-6), 0.0)
         way = [self._moved(slot, pose, s * s * (3.0 - 2.0 * s)) for s in share * _STEPS]
         clear = np.full(len(way), True) if ego is None else clear_of(ego, np.array(way), HALF_CAR)
         moved = way[-1] if clear.all() else way[max(int(clear.argmin()) - 1, 0)]
