@@ -8,8 +8,9 @@ import shapely
 import parkenv
 from parkenv import OccupancyProcess
 from parkenv.world.cue_scene import ARRIVED_S, CueScene
-from parkenv.world.cues import Cues, lead_of
+from parkenv.world.cues import Cues
 from parkenv.world.lot_scene import LotScenes, slot_lot
+from parkenv.world.occupancy.kernel import shown_s
 from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.camera.weather import Weather
 from sim_sensors.ground_truth import vehicle_boxes
@@ -43,7 +44,7 @@ class Departure:
             np.arange(self.scenario.lot.n_slots),
         )
         ends = self.world.next_free(self.slots, arrival.time)
-        leads = np.array([lead_of(self.key, s, end, 31.0) for s, end in enumerate(ends)])
+        leads = np.array([shown_s(self.key, s, end, 31.0) for s, end in enumerate(ends)])
         chosen = (leads > 14.0) & (leads < 90.0) & (ends > arrival.time + 130.0)
         self.slot = int(np.flatnonzero(chosen)[0])
         self.end, self.lead, self.begin = ends[self.slot], leads[self.slot], arrival.time

@@ -192,7 +192,7 @@ def test_cars_of_a_fleet_and_of_its_background_show_that_they_leave(background):
         agents, *_ = env.step(actions)
         for car, seen in agents.items():
             assert env.observation_space(car).contains(seen)
-            shown += int((seen["cues"].reshape(2, -1)[0] > 0.5).sum())
+            shown += int((seen["cues"].reshape(3, -1)[0] > 0.5).sum())
     assert shown > 0
 
 
@@ -210,11 +210,52 @@ def test_belief_gains_from_cues_in_a_nearly_full_lot():
     assert (sensed - none).mean() < -20.0
 
 
+@pytest.mark.parametrize("cues", [Cues(20.0), Cues(60.0, 0.6, 0.05)], ids=["perfect", "sensed"])
+def test_the_models_belief_is_that_of_the_environment(cues):
+    scenario, rng = busy(cues, p=0.9), np.random.default_rng(1)
+    env, model = gym.make("parkenv/Search-v2", scenario=scenario), parkenv.model(scenario)
+    n, compared = scenario.lot.n_slots, 0
+    for seed in range(3):
+        observation, _ = env.reset(seed=seed)
+        belief = model.initial_belief(observation)
+        for _ in range(30):
+            action = int(rng.choice(np.flatnonzero(observation["action_mask"][:4])))
+            observation, *_ = env.step(action)
+            belief = model.update(belief, action, observation)
+            np.testing.assert_allclose(belief.slots.p_occupied, observation["p_occupied"], atol=2e-5)
+            np.testing.assert_allclose(belief.slots.cues[:n], observation["cues"][:n], atol=2e-5)
+            compared += int((observation["cues"][:n] > 0.1).sum())
+    assert compared > 5
+
+
+def test_worlds_of_the_model_leave_as_its_belief_says():
+    scenario, rng = busy(Cues(30.0, 0.6, 0.05), p=0.9), np.random.default_rng(1)
+    env, model = gym.make("parkenv/Search-v2", scenario=scenario), parkenv.model(scenario)
+    shown = []
+    for seed in range(8):
+        observation, _ = env.reset(seed=seed)
+        steps = 0
+        while steps < 12 or observation["action_mask"][:4].all():
+            observation, *_ = env.step(int(rng.choice(np.flatnonzero(observation["action_mask"][:4]))))
+            steps += 1
+        belief = model.initial_belief(observation)
+        sample = model.sample(belief, rng, 200)
+        sample.reseed(rng)
+        waiting = int(np.flatnonzero(observation["action_mask"][:4] == 0)[0])
+        for _ in range(30):
+            sample.step(waiting)
+        seen, later = sample.observation(), belief.slots.decay(sample.observation().time - belief.slots.time)
+        looks = np.array([sample.observation(i).taken for i in range(len(sample))])
+        said, free = 1.0 - later.p_occupied[seen.slots], 1.0 - looks.mean(axis=0)
+        shown.append((free.mean(), said.mean(), free[said.argmax()], said.max()))
+    free, said, most_free, most_said = np.transpose(shown)
+    assert free.mean() == pytest.approx(said.mean(), abs=0.01)
+    assert most_free.mean() == pytest.approx(most_said.mean(), abs=0.04)
+
+
 def test_what_does_not_know_cues_says_so(tmp_path):
     with pytest.raises(InputError, match=r"hit_rate is 0.1, want it above false_alarm_rate, 0.1"):
         Cues(hit_rate=0.1, false_alarm_rate=0.1)
-    with pytest.raises(InputError, match=r"cues of departures, which the model does not know"):
-        parkenv.model(busy(Cues()))
     with pytest.raises(InputError, match=r"cues of departures are not perceived"):
         gym.make("parkenv/SearchPerception-v2", scenario=busy(Cues()))
     for given in ("often", "0.5", "0.5,0.1,31,9"):

@@ -14,6 +14,8 @@ import math
 
 from parkenv.compiled.jit import compiled
 
+MOST_EVIDENCE = 20.0  # of an observation, logarithm of a ratio of likelihoods
+
 
 @compiled(inline="always")
 def freed(excess: float, rate: float, decay_rate: float, elapsed: float) -> float:

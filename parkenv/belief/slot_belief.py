@@ -20,6 +20,7 @@ _SURE, _NOTHING = np.zeros(2), np.zeros(0)
 _SURE.flags.writeable = _NOTHING.flags.writeable = False
 
 UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2  # result of a slot's last observation
+_LEAST_P = 1e-6
 _SURELY_LEFT = 8.0  # decay rate times age up to which something of an observation is left
 
 
@@ -61,8 +62,9 @@ class SlotBelief:
             the level and of the slope to the goal; see `parkenv.world.occupancy.day_error`.
         step_observed: (4 * k,) float, what the last step observed, four consecutive parts: slot, or -1; whether it was
             observed taken; hit rate; false-alarm rate. See `observations`.
-        cues: (2 * n_slots,) float, or empty without cues, two parts: the excess that each slot's last observation left,
-            and 1/s, the rate at which a car that is about to leave leaves; see `cue_belief`.
+        cues: (3 * n_slots,) float, or empty without cues, three parts: the excess that each slot's last observation
+            left; 1/s, the rate at which a car that is about to leave leaves; and what the last step observed of it, the
+            logarithm of P(it | about to leave) / P(it | not), 0 of other slots. See `cue_belief`.
 
     Examples:
         Slot 1 is observed free and stays likely to be free for a while.
@@ -193,7 +195,7 @@ class SlotBelief:
         """Return the belief of some of the slots, (k,), in float64."""
         parts = self._rows[:, slots].astype(np.float64)
         p_occupied = self.p_occupied[slots].astype(np.float64)
-        cues = self.cues.reshape(2, -1)[:, slots if len(self.cues) else []].astype(np.float64)
+        cues = self.cues.reshape(3, -1)[:, slots if len(self.cues) else []].astype(np.float64)
         observed = slot, _, *rest = self.observations.take(slots)
         taken = type(self)(
             p_occupied, parts.ravel(), self.time, self.day_error, np.concatenate([slot, *rest]), cues.ravel()
@@ -207,6 +209,7 @@ class SlotBelief:
         observed_taken: ArrayLike,
         hit_rate: ArrayLike = 1.0,
         false_alarm_rate: ArrayLike = 0.0,
+        cue_evidence: ArrayLike = 0.0,
     ) -> Self:
         """Return the belief after observations of some slots (Bayes' rule).
 
@@ -215,6 +218,7 @@ class SlotBelief:
             observed_taken: (k,) bool, observed states.
             hit_rate: (k,) or scalar, P(observed taken | taken).
             false_alarm_rate: (k,) or scalar, P(observed taken | free).
+            cue_evidence: (k,) or scalar, what shows that the car in it leaves, as in `cues`; 0: not observed.
         """
         observed = np.asarray(slots, dtype=np.int64)
         kinds = (observed_taken, np.bool_), (hit_rate, np.float64), (false_alarm_rate, np.float64)
@@ -226,11 +230,27 @@ class SlotBelief:
         step_observed = np.hstack([before, [observed, reports, hits, false_alarms]]).ravel()
         p_occupied, parts = self.p_occupied.astype(np.float64), self.parts.astype(np.float64)
         cues = self.cues.astype(np.float64)
-        cues[observed if len(cues) else []] = 0.0
         later = type(self)(p_occupied, parts, self.time, self.day_error, step_observed, cues)
         _update_slots(later.p_occupied, observed, reports, hits, false_alarms)
+        if len(cues):
+            of_cues = cues.reshape(3, -1)
+            of_cues[2, observed] = np.where(reports, cue_evidence, 0.0)
+            of_cues[0, observed] = self._excess_after(of_cues, observed, reports, later.p_occupied)
         later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time
         return later
+
+    def _excess_after(
+        self, cues: FloatArray, slots: IntArray, taken: BoolArray, p_after: FloatArray
+    ) -> FloatArray:
+        """Return the excess that observations of slots leave, (k,), given P(taken) after them, (n_slots,)."""
+        excess, rate, evidence = cues[:, slots]
+        usual = self.decay_rate[slots] * (1.0 - self.forecast[slots]) / rate
+        age = np.where(excess != 0.0, self.age[slots], 0.0)
+        there = np.maximum(self.p_occupied[slots], _LEAST_P)
+        before = excess * np.exp(-rate * age) * p_after[slots] / there
+        about_to = np.clip(usual * p_after[slots] + before, 0.0, p_after[slots])
+        odds = np.exp(evidence) * about_to
+        return np.where(taken, odds / (odds + 1.0 - about_to) - usual * p_after[slots], 0.0)
 
     def with_reservation(self, reserved: NDArray[np.integer]) -> Self:
         """Return the belief of a car that takes no slot but the one reserved for it, (n_slots,): 1 there, 0 elsewhere.
@@ -254,6 +274,10 @@ class SlotBelief:
         later.p_occupied = _decay_slots(
             later.forecast, later.decay_rate, later.p_observed, later.age, self.cues
         )
+        if len(self.cues):
+            later.cues = np.concatenate(
+                [self.cues[: 2 * len(self.p_occupied)], np.zeros(len(self.p_occupied))]
+            )
         return later
 
 

@@ -64,7 +64,7 @@ class Fleet(FleetMemory):
     | Key | Space | Meaning | with |
     |-----|-------|---------|------|
     | `reserved` | `Box(-1, 1, (n_slots,), int8)` | 1: reserved for this car; -1: it knows of none | `reserve` |
-    | `cues` | `Box((2 * n_slots,), float32)` | as in `parkenv/Search-v2` | `scenario.cues` |
+    | `cues` | `Box((3 * n_slots,), float32)` | as in `parkenv/Search-v2` | `scenario.cues` |
     | `cars` | `Box(0, 127, (2, n_vertices), int8)` | other cars in view at each vertex; standing | `sees_cars` |
     | `driver` | `Box(0, inf, (6,), float64)` | its `Drivers`, stay first, and the factor of its walk | rules of zones |
 

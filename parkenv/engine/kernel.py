@@ -14,7 +14,7 @@ import numpy as np
 from numba.cpython.unsafe.tuple import tuple_setitem
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from parkenv.belief.cue_belief import freed
+from parkenv.belief.cue_belief import MOST_EVIDENCE, freed
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
@@ -24,6 +24,7 @@ from parkenv.compiled.keyed_random import (
     SCENARIO_STREAM,
     VIEW_STREAM,
     episode_key,
+    keyed_exponential,
     keyed_uniform,
 )
 from parkenv.compiled.memory import float32s, float64s, int32s, int64s
@@ -103,6 +104,7 @@ def read_step(scenario_index: int, result: tuple[Any, ...]) -> tuple[float, bool
 
 _LOGISTIC = 1.702  # the logistic law of z times this is closest to the normal one
 _LEAST_P = 1e-6
+_MOST_TRIES = 10_000
 _SURE = 8.0  # standard deviations beyond which a facility is surely full, or not
 _ABOVE = 1e-3  # how far above its forecast a facility is at least whose count says that it is full
 SCENARIO_BYTES = SCENARIO.itemsize
@@ -379,6 +381,9 @@ def drive_or_park(search: Any, action: int) -> None:
     scenario, vertex = scenario_at(search.scenario, 0), search.vertex
     edge = edge_at(scenario.edges, vertex * N_ACTIONS + action)
     clear_step(search)
+    if search.cues != 0:
+        for slot in range(scenario.n_slots):
+            float32s(search.cues)[2 * search.width + slot] = 0.0
     search.step_drive_s = edge.seconds
     search.driven_m += edge.metres
     target = edge.target
@@ -546,7 +551,7 @@ def apply_cue(search: Any, column: int, seen: bool, hit_rate: float, false_alarm
         cue_at(search.cue_table, column), block.p_observed[k], block.prior[k], block.decay_rate[k]
     )  # fmt: skip
     rate = leaving_rate(search, prior, decay_rate)
-    usual, before, excess = decay_rate * (1.0 - prior) / rate, 0.0, 0.0
+    usual, before, excess, evidence = decay_rate * (1.0 - prior) / rate, 0.0, 0.0, 0.0
     if record.observed_taken:
         if cue.excess != 0.0 and cue.at < time:
             # What the earlier cue has left, of the cars that were still expected to be there
@@ -557,9 +562,13 @@ def apply_cue(search: Any, column: int, seen: bool, hit_rate: float, false_alarm
             before = cue.excess
         about_to = min(max(usual * p + before, 0.0), p)
         excess = bayes_update(about_to, seen, hit_rate, false_alarm_rate) - usual * p
-    cue.excess, cue.at, cue.p = excess, time, p
+        if_leaves, if_not = (hit_rate, false_alarm_rate) if seen else (1.0 - hit_rate, 1.0 - false_alarm_rate)
+        least = math.exp(-MOST_EVIDENCE)
+        evidence = math.log(max(if_leaves, least) / max(if_not, least))
+    cue.excess, cue.at, cue.p, cue.evidence = excess, time, p, evidence
     if search.cues != 0:
         float32s(search.cues)[record.slot] = excess
+        float32s(search.cues)[2 * search.width + record.slot] = evidence
 
 
 @inlined
@@ -592,6 +601,28 @@ def in_the_way_s(search: Any, time: float) -> float:
     # Its state is still to be observed: `observe_exact` takes a valid one for observed.
     record.valid_until, record.end_known = -np.inf, False
     return float(left if left <= scenario.moving_s else 0.0)
+
+
+@kernel
+def draw_departure(search: Any, column: int, announced: bool) -> None:
+    """Draw when the car in a slot leaves, given that it is taken now and whether it shows that it leaves.
+
+    Without any sign it first waits until it shows, at the rate of departures (see `cue_belief`). The time from the
+    first sign hangs on the key and the millisecond of the departure: the next one that agrees is taken.
+    """
+    record, k, time = slot_at(search.slots, column), column & (BLOCK_SIZE - 1), search.time
+    block, slot = block_at(search.blocks, column >> BLOCK_BITS), np.int64(record.slot)
+    shows = block.decay_rate[k] * (1.0 - block.prior[k])
+    leaves = leaving_rate(search, block.prior[k], block.decay_rate[k])
+    left = keyed_exponential(search.key, CUE_STREAM, slot, -1) / leaves
+    if not announced:
+        left += keyed_exponential(search.key, CUE_STREAM, slot, -2) / max(shows, _LEAST_P)
+    end, lead_s = time + left, scenario_at(search.scenario, 0).lead_s
+    for _ in range(_MOST_TRIES):
+        if (end - time <= worlds.shown_s(search.key, slot, end, lead_s)) == announced:
+            break
+        end += 0.001
+    record.occupied, record.since, record.valid_until, record.end_known = True, time, end, True
 
 
 @kernel

@@ -11,6 +11,7 @@ its posterior, and the slots given the day. On request, days may also be unlike 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -26,17 +27,29 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of, call_at
 from parkenv.engine.batch import first_wrong
 from parkenv.engine.kernel import (
+    draw_departure,
     drive_or_park,
     enter,
     finish_step,
     give_up,
+    is_about_to_leave,
     step_cost_s,
     sum_of_costs,
     take_step,
     write_clock,
 )
 from parkenv.engine.policy import CompiledPolicy, car_of
-from parkenv.engine.records import CAR, FLEET, N_ACTIONS, NO_SLOT, SEARCH, scenario_at, search_at, slot_at
+from parkenv.engine.records import (
+    CAR,
+    FLEET,
+    N_ACTIONS,
+    NO_SLOT,
+    SEARCH,
+    cue_at,
+    scenario_at,
+    search_at,
+    slot_at,
+)
 from parkenv.engine.search_belief import column_of, end_observed, is_taken, set_belief_of
 from parkenv.engine.searches import ScenarioRecords, Searches, most_observed_in
 from parkenv.engine.spaces import action_number
@@ -68,13 +81,17 @@ class Observation(NamedTuple):
     # (k,) float64, P(observed taken | taken) and P(observed taken | free); 1 and 0 of an attempt
     hit_rate: FloatArray
     false_alarm_rate: FloatArray
+    cue_evidence: FloatArray  # (k,) float64, what shows that the car in it leaves, see `SlotBelief.cues`
 
     @classmethod
     def of(cls, observation: Mapping[str, Any] | Observation) -> Observation:
         if isinstance(observation, Observation):
             return observation
         slots, _, taken, *rates = SlotBelief.of_observation(observation).observations
-        return cls(int(observation["vertex"]), float(observation["time"][1]), slots, taken, *rates)
+        evidence = np.zeros(len(slots))
+        if "cues" in observation:
+            evidence = observation["cues"].reshape(3, -1)[2, slots].astype(np.float64)
+        return cls(int(observation["vertex"]), float(observation["time"][1]), slots, taken, *rates, evidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +156,13 @@ class Simulations:
 
     def observation(self, i: int = 0) -> Observation:
         rows, record = self.searches.step_observed[i], self.searches.records[i]
-        slots, taken, *rates = rows[:, : int(record["n_step_observed"])].astype(np.float64)
+        of_slots, taken, *rates = rows[:, : int(record["n_step_observed"])].astype(np.float64)
+        slots, evidence = of_slots.astype(np.int64), np.zeros(len(of_slots))
+        if len(self.searches.cue_table):
+            cues = self.searches.cue_table[i][self.searches.columns[i][slots]]
+            evidence = np.where(cues["at"] == record["time"], cues["evidence"], 0.0)
         return Observation(
-            int(record["vertex"]), float(record["clock"][1]), slots.astype(np.int64), taken == 1.0, *rates
+            int(record["vertex"]), float(record["clock"][1]), slots, taken == 1.0, *rates, evidence
         )
 
     def step(self, actions: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -202,7 +223,7 @@ class Model:
 
     Args:
         problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept. Live counts of
-            facilities, and cues of departures, are refused.
+            facilities are refused.
         any_day: whether days may be unlike their forecast, with the probabilities of `belief` (`DayBelief`): an event
             has filled the slots near the goal, or the forecast carries no information, of the day or of single slots.
             `sample` draws all slots from such a day; their later changes follow the forecast.
@@ -210,10 +231,6 @@ class Model:
 
     def __init__(self, problem: SearchProblem, any_day: bool = False) -> None:
         self.problem, self._any_day = problem.public(), any_day
-        require(
-            self.problem.cues is None,
-            f"scenario on {self.problem.lot.name!r} has cues of departures, which the model does not know; want none",
-        )
         require(
             len(self.problem.live_slots) == 0,
             f"lot {self.problem.lot.name!r} has live counts, want one without them",
@@ -284,9 +301,22 @@ class Model:
             drawn.searches.address, keys[rows], belief.vertex, belief.arrival, belief.slots.time, belief.n_steps,
             np.exp(level)[rows], slope[rows], slots, taken[rows], n_observed, belief.last_taken[slots],
             belief.slots.p_observed[slots], belief.slots.observed_at[slots],
+            *self._announced(belief.slots, slots, taken, rng, rows),
         )  # fmt: skip
         drawn.searches.records["over"] = belief.over
         return drawn
+
+    def _announced(
+        self, belief: SlotBelief, slots: IntArray, taken: BoolArray, rng: np.random.Generator, rows: IntArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Return the excess of each slot's last cue, (k,), and whether its car shows now that it leaves, (n, k)."""
+        if not len(belief.cues):
+            return np.zeros(0), np.zeros((len(rows), 0), np.bool_)
+        excess, rate, _ = belief.cues.reshape(3, -1)[:, slots].astype(np.float64)
+        p = np.maximum(belief.p_occupied[slots], MIN_PROBABILITY)
+        usual = belief.decay_rate[slots] * (1.0 - belief.forecast[slots]) / rate
+        age = np.where(excess != 0.0, belief.age[slots], 0.0)
+        return excess, (taken & (rng.random(taken.shape) < usual + excess * np.exp(-rate * age) / p))[rows]
 
     def step(
         self, state: Simulations, action: int, rng: np.random.Generator | None = None
@@ -312,7 +342,7 @@ class Model:
     def update(self, belief: Belief, action: int, observation: Mapping[str, Any] | Observation) -> Belief:
         """Return the belief after an action and what was observed then, in the model or the environment."""
         self._require_own(belief)
-        vertex, time, slots, taken, *rates = Observation.of(observation)
+        vertex, time, slots, taken, *rates, evidence = Observation.of(observation)
         target = int(self.problem.edges["target"][belief.vertex, action_number(action)])
         require(
             vertex == target,
@@ -322,7 +352,7 @@ class Model:
         times = np.full(len(slots), time)
         times[:attempts] = belief.slots.time
         by_attempt, on_arrival = (
-            (slots[part], taken[part], *(rate[part] for rate in rates))
+            (slots[part], taken[part], *(rate[part] for rate in (*rates, evidence)))
             for part in (slice(attempts), slice(attempts, None))
         )
         attempted = belief.slots.update(*by_attempt)
@@ -348,8 +378,8 @@ class Model:
     ) -> FloatArray:
         """Return how probable an observation is after an action in each simulation, (n,): weights of a particle filter.
 
-        Which slots can be seen has nothing to do with where cars are, and does not count; 0 where the action leads
-        elsewhere or takes another time.
+        Up to a common factor, with cues; which slots can be seen has nothing to do with where cars are, and does not
+        count. 0 where the action leads elsewhere or takes another time.
         """
         self._require_own(state)
         vertex, time, slots, *seen = Observation.of(observation)
@@ -438,6 +468,8 @@ def _sample_at(
     last_taken: BoolArray,
     p_observed: FloatArray,
     observed_at: FloatArray,
+    excess: FloatArray,
+    announced: BoolArray,
 ) -> None:
     """Put a search into the situation of a belief, in a world of which the day and some slots are given.
 
@@ -459,6 +491,11 @@ def _sample_at(
                 # What comes does not depend on when the state began.
                 record.occupied, record.sojourn, record.end_known = taken[e, i], 1, False
                 record.since = record.valid_until = search.time
+                if len(excess) > 0:
+                    cue = cue_at(search.cue_table, column)
+                    cue.excess, cue.at, cue.p = excess[i], arrival + observed_at[i], p_observed[i]
+                    if taken[e, i]:
+                        draw_departure(search, column, announced[e, i])
         write_clock(search)
 
 
@@ -479,12 +516,18 @@ def _step_at(address: int, actions: IntArray, costs: FloatArray, over: BoolArray
 def _reseed_at(address: int, keys: NDArray[np.uint64]) -> None:
     for e in range(len(keys)):
         search = search_at(address, e)
+        old = search.key
         for column in range(1, search.n_columns + 1):
             record = slot_at(search.slots, column)
             if record.sojourn > 0:
+                announced = search.cue_table != 0 and is_about_to_leave(search, column, search.time)
                 is_taken(search, column, search.time)
                 record.since = record.valid_until = search.time
                 record.end_known = False
+                search.key = keys[e]
+                if search.cue_table != 0 and record.occupied:
+                    draw_departure(search, column, announced)
+                search.key = old
         search.key = keys[e]
 
 
@@ -519,6 +562,7 @@ def _probability_at(
     taken: BoolArray,
     hit_rate: FloatArray,
     false_alarm_rate: FloatArray,
+    evidence: FloatArray,
     p: FloatArray,
 ) -> None:
     for e in range(len(p)):
@@ -532,5 +576,9 @@ def _probability_at(
             p[e] = 0.0
         for i in range(len(slots)):
             at = before if i < attempts else search.time
-            rate = hit_rate[i] if is_taken(search, column_of(search, slots[i]), at) else false_alarm_rate[i]
+            column = column_of(search, slots[i])
+            rate = hit_rate[i] if is_taken(search, column, at) else false_alarm_rate[i]
             p[e] *= rate if taken[i] else 1.0 - rate
+            if evidence[i] != 0.0:
+                leaves = is_about_to_leave(search, column, at)
+                p[e] /= 1.0 + math.exp(-evidence[i] if leaves else evidence[i])

@@ -187,7 +187,7 @@ SEARCH = _with_costs(
         ("most_observed", np.int64),
         ("step_observed", ADDRESS),  # (4, most_observed) float32, as in the observation, or 0
         ("cue_table", ADDRESS),  # CUE records by column, or 0 where no scenario has cues
-        ("cues", ADDRESS),  # (2, width) float32, as in the observation, or 0
+        ("cues", ADDRESS),  # (3, width) float32, as in the observation, or 0
     ],
     costs=COST_FIELDS[0],
     step_costs=STEP_FIELDS[0],
@@ -210,8 +210,9 @@ SLOT = np.dtype(
 )
 """A slot with a column: true state as in CURSOR, and the search's observations of it."""
 
-CUE = np.dtype([("excess", np.float64), ("at", np.float64), ("p", np.float64)], align=True)
-"""What the last observation of a slot has left: the excess of `belief.cue_belief`, its time, s, and P(taken)."""
+CUE = np.dtype([(name, np.float64) for name in ("excess", "at", "p", "evidence")], align=True)
+"""What the last observation of a slot has left: the excess of `belief.cue_belief`, its time, s, P(taken), and what was
+observed: the logarithm of P(it | about to leave) / P(it | not)."""
 
 SPARSE_SLOTS = 4096
 """Slots from which the tables of a fleet's searches take memory only where they are written."""

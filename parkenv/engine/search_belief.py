@@ -198,7 +198,8 @@ def add_column(search: Any, slot: int) -> int:
     record.slot, record.sojourn, record.valid_until = slot, 0, 0.0
     record.observed = record.observed_taken = record.passed = False
     if search.cue_table != 0:
-        cue_at(search.cue_table, column).excess = 0.0
+        cue = cue_at(search.cue_table, column)
+        cue.excess, cue.at = 0.0, -np.inf
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
     prior, rate = forecast_of(search, slot)
     if search.n_forbidden > 0 and is_forbidden(search, slot):
@@ -283,7 +284,7 @@ def init_full_prior(search: Any) -> None:
     if search.cues != 0:
         for slot in range(n):
             forecast, decay_rate = belief[FORECAST * width + slot], belief[DECAY_RATE * width + slot]
-            float32s(search.cues)[slot] = 0.0
+            float32s(search.cues)[slot] = float32s(search.cues)[2 * width + slot] = 0.0
             lead_s = scenario.lead_s
             rate = leaving_rate(search, forecast, decay_rate) if lead_s > 0.0 else 0.0
             float32s(search.cues)[width + slot] = rate

@@ -205,7 +205,7 @@ class Searches:
         self.step_observed = np.zeros((n, 4, k) if k > 0 else (0, 4, 0), np.float32)
         has_cues = bool((scenarios.records["lead_s"] > 0.0).any())
         self.cue_table = zeros((n if has_cues else 0, m + 1), CUE)
-        self.cues = np.zeros((n if has_cues and full_belief else 0, 2, m), np.float32)
+        self.cues = np.zeros((n if has_cues and full_belief else 0, 3, m), np.float32)
         self.records["width"], self.records["most_observed"], self.records["n_step_used"] = m, k, k
         self.records["walks"], self.records["reserved"] = 1.0, UNGUIDED
         self.records["scenarios"] = address_of(scenarios.records, SCENARIO)

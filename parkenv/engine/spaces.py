@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from parkenv.belief.cue_belief import MOST_EVIDENCE
 from parkenv.engine.records import NEVER_OBSERVED
 from parkenv.engine.searches import most_observed_in
 from parkenv.errors import InputError
@@ -23,6 +24,7 @@ OBSERVATIONS = ("full", "occupancy", "local")
 """What a search may observe; see `parkenv.envs.search.SearchEnv`."""
 BELIEF_PARTS = ("belief", "step_observed", "cues")  # what `occupancy` leaves out of `full`
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
+_CUE_PARTS = [(-1.0, 1.0), (0.0, MAX_DECAY_RATE), (-MOST_EVIDENCE, MOST_EVIDENCE)]
 _FLAT = ("p_occupied", "day_error", "action_mask")
 
 
@@ -37,7 +39,7 @@ def space_of(scenarios: Sequence[SearchProblem], most_observed: int | None = Non
 def search_space(n_slots: int, n_vertices: int, most_observed: int, cues: bool = False) -> spaces.Dict:
     belief = _box_of_parts([(0.0, 1.0), (0.0, MAX_DECAY_RATE), (0.0, 1.0), (NEVER_OBSERVED, LATEST)], n_slots)
     observed = _box_of_parts([(-1.0, n_slots - 1.0), *[(0.0, 1.0)] * 3], most_observed)
-    further = {"cues": _box_of_parts([(-1.0, 1.0), (0.0, MAX_DECAY_RATE)], n_slots)} if cues else {}
+    further = {"cues": _box_of_parts(_CUE_PARTS, n_slots)} if cues else {}
     return spaces.Dict(
         {
             "vertex": spaces.Discrete(n_vertices),

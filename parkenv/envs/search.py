@@ -84,7 +84,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | `step_observed` | `Box((4 * k,), float32)` | what the last step observed, four parts as below |
     | `day_error` | `Box(0, 5, (2,), float32)` | how far whole days differ from the forecast, logits, as below |
     | `action_mask` | `Box(0, 1, (5,), int8)` | the valid actions at this vertex |
-    | `cues` | `Box((2 * n_slots,), float32)` | only with `scenario.cues`: what shows that cars leave |
+    | `cues` | `Box((3 * n_slots,), float32)` | only with `scenario.cues`: what shows that cars leave |
 
     `belief` has four parts of n_slots numbers each; unpack them with
     `forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)`:
@@ -115,8 +115,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     An observation updates the belief in a slot by Bayes' rule; then the belief decays to the forecast:
     `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
 
-    `cues` has two parts: P(the car is about to leave) right after a slot was observed taken, beyond the usual, and the
-    rate, 1/s, at which such a car leaves. They lower `p_occupied`, see `parkenv.belief.cue_belief`.
+    `cues` has three parts: P(the car is about to leave) right after a slot was observed taken, beyond the usual; the
+    rate, 1/s, at which such a car leaves; and what the last step observed of it, as the logarithm of P(it | about to
+    leave) / P(it | not). They lower `p_occupied`, see `parkenv.belief.cue_belief`.
 
     ## Rewards
     Minus the duration of the step, s. Parking also subtracts the walk to the goal and the slot's parking cost

@@ -63,7 +63,7 @@ class CueScene:
             if lead - door_s < left <= lead + WALK_S:
                 people.append(self._driver(scene, slot, end, max(left - lead, 0.0)))
             elif left <= min(lead, LAMPS_S):
-                scene = self._leaving(scene, slot, end, left, lead, ego)
+                scene = self._leaving(scene, slot, left, lead, ego)
         scene = self._arrived(scene, slots, time)
         if not people:
             return scene
@@ -93,9 +93,7 @@ class CueScene:
         pose = np.array([*place, math.atan2(ahead[1], ahead[0])])
         return pose, walked / STRIDE_M % 1.0, int(LOOKS * self._draw(slot, end, 2))
 
-    def _leaving(
-        self, scene: Scene, slot: int, end: float, left: float, lead: float, ego: FloatArray | None
-    ) -> Scene:
+    def _leaving(self, scene: Scene, slot: int, left: float, lead: float, ego: FloatArray | None) -> Scene:
         pose, out = scene.vehicle_pose[slot], self._out[slot]
         reverses = not self._at_kerb[slot] and math.cos(pose[2]) * out[0] + math.sin(pose[2]) * out[1] < 0.0
         lamps = Lamps.TAIL | Lamps.HEAD | (Lamps.REVERSING if reverses else Lamps(0))
