@@ -254,8 +254,8 @@ def test_worlds_of_the_model_leave_as_its_belief_says():
 
 
 def test_what_does_not_know_cues_says_so(tmp_path):
-    with pytest.raises(InputError, match=r"hit_rate is 0.1, want it above false_alarm_rate, 0.1"):
-        Cues(hit_rate=0.1, false_alarm_rate=0.1)
+    with pytest.raises(InputError, match=r"hit_rate is 0.1, want at least false_alarm_rate, 0.2"):
+        Cues(hit_rate=0.1, false_alarm_rate=0.2)
     with pytest.raises(InputError, match=r"cues of departures are not perceived"):
         gym.make("parkenv/SearchPerception-v2", scenario=busy(Cues()))
     for given in ("often", "0.5", "0.5,0.1,31,9"):

@@ -4,7 +4,7 @@ from typing import Literal, get_args
 
 PackagedLot = Literal["campus", "jam", "street", "mini", "town", "kerbs"]
 PACKAGED_LOTS: tuple[PackagedLot, ...] = get_args(PackagedLot)
-SCENARIO_NAMES = PACKAGED_LOTS  # packaged scenarios; each has a lot of the same name
+SCENARIO_NAMES = (*PACKAGED_LOTS, "rush")  # packaged scenarios; all but rush have a lot of their own
 SuiteName = Literal["v3", "streets-v1"]  # benchmark suites
 LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")  # suffixes of lot files
 SensorModelName = Literal["perfect", "blind", "laser", "stereo"]

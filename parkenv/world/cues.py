@@ -35,7 +35,8 @@ class Cues(Validated):
             fleets, manoeuvres block lanes instead.
 
     Raises:
-        InputError: a value out of its range, or uninformative cues (equal rates).
+        InputError: a value out of its range, or a false-alarm rate above the hit rate. Equal rates say nothing: cars
+            leave as with other cues, and nobody notices.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid", strict=False)  # as a table of a scenario file
@@ -48,6 +49,6 @@ class Cues(Validated):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(
-            self.hit_rate > self.false_alarm_rate,
-            f"hit_rate is {self.hit_rate:g}, want it above false_alarm_rate, {self.false_alarm_rate:g}",
+            self.hit_rate >= self.false_alarm_rate,
+            f"hit_rate is {self.hit_rate:g}, want at least false_alarm_rate, {self.false_alarm_rate:g}",
         )

@@ -134,6 +134,10 @@ class OracleAgent(SearchAgent[OracleState]):
             # All reachable slots were observed, but the lot is not proven full: an unreachable slot is free.
             best = best_slot(self.problem, self.routes, self._world, vertex, now, self.problem.wait_s)
             vars(memory).update(vars(self._bound_for(best, vertex)))
+        elif self.problem.cues is not None:
+            # Cars that move out may have been in the way.
+            best = best_slot(self.problem, self.routes, self._world, vertex, now, self.problem.wait_s)
+            vars(memory).update(vars(self._bound_for(best, vertex)))
         if memory.slot < 0:
             return wait
         if memory.waits > 0 and can_wait:
