@@ -1,7 +1,8 @@
 """The car's surroundings as a vector of the same length on every lot, for policies that transfer between lots.
 
 The vector has 46 + 8k numbers from 0 to 1. A time of s seconds is encoded as s / (s + 60): a minute becomes 0.5, and
-distant or missing slots come close to, or equal, 1. Probabilities are not transformed. The slots "ahead" of a move are
+distant or missing slots come close to, or equal, 1. Probabilities are not transformed. Where cars show that they
+leave, "free" is free or about to be. The slots "ahead" of a move are
 the k nearest slots, by drive time, whose shortest path from here starts with that move.
 
 | Index | Meaning |
@@ -57,11 +58,19 @@ from parkenv.engine.records import (
     SENTINEL,
     UNGUIDED,
     block_at,
+    cue_at,
     scenario_at,
     search_at,
     slot_at,
 )
-from parkenv.engine.search_belief import add_column, column_of, decay_belief, forecast_of, set_belief_of
+from parkenv.engine.search_belief import (
+    add_column,
+    column_of,
+    decay_belief,
+    forecast_of,
+    leaving_rate,
+    set_belief_of,
+)
 from parkenv.engine.searches import ScenarioRecords, Searches
 from parkenv.errors import require_whole
 from parkenv.world.lot import MOVES
@@ -183,7 +192,8 @@ class FollowedSearch:
         local = np.empty(self._n_numbers, np.float32)
         parts = (observation[name] for name in ("time", "p_occupied", "belief", "step_observed"))
         vertex = int(observation["vertex"])
-        follow_at(self._search.address, self._around, begins is not None, vertex, *parts, local)
+        cues = observation.get("cues", np.empty(0, np.float32))
+        follow_at(self._search.address, self._around, begins is not None, vertex, *parts, cues, local)
         return {"local": local, "action_mask": observation["action_mask"]}
 
 
@@ -197,6 +207,7 @@ def follow_at(
     p_occupied: NDArray[np.float32],
     belief: NDArray[np.float32],
     step_observed: NDArray[np.float32],
+    cues: NDArray[np.float32],
     local: NDArray[np.float32],
 ) -> None:
     search, n, most = search_at(address, 0), p_occupied.size, step_observed.size // 4
@@ -211,7 +222,11 @@ def follow_at(
         slot = int(step_observed[i])
         if slot >= 0:
             p, observed_at = belief[P_OBSERVED * n + slot], belief[OBSERVED_AT * n + slot]
-            set_belief_of(search, column_of(search, slot), step_observed[most + i] == 1.0, p, observed_at)
+            column = column_of(search, slot)
+            set_belief_of(search, column, step_observed[most + i] == 1.0, p, observed_at)
+            if cues.size > 0:
+                cue = cue_at(search.cue_table, column)
+                cue.excess, cue.at = cues[slot], observed_at
     for column in range(SENTINEL + 1, search.n_columns + 1):
         block, k = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
         block.p_occupied[k] = p_occupied[slot_at(search.slots, column).slot]
@@ -296,8 +311,22 @@ def _write_local(search: Any, around: Surroundings, local: NDArray[np.float32]) 
 def _p_occupied(search: Any, column: int) -> float:
     if search.reserved != UNGUIDED:
         return 0.0 if slot_at(search.slots, column).slot == search.reserved else 1.0
-    p = block_at(search.blocks, column >> BLOCK_BITS).p_occupied[column & (BLOCK_SIZE - 1)]
-    return float(np.float32(p))
+    p = np.float32(block_at(search.blocks, column >> BLOCK_BITS).p_occupied[column & (BLOCK_SIZE - 1)])
+    if search.cue_table != 0:
+        return max(float(p) - _announced(search, column), 0.0)
+    return float(p)
+
+
+@kernel
+def _announced(search: Any, column: int) -> float:
+    """Return P(about to leave) beyond the usual, from numbers rounded as in observations."""
+    cue, k = cue_at(search.cue_table, column), column & (BLOCK_SIZE - 1)
+    block = block_at(search.blocks, column >> BLOCK_BITS)
+    if cue.excess == 0.0 or cue.at != block.observed_at[k]:
+        return 0.0
+    rate = np.float32(leaving_rate(search, np.float32(block.prior[k]), np.float32(block.decay_rate[k])))
+    gap = np.float32(search.time - search.arrival) - np.float32(cue.at - search.arrival)
+    return float(np.float32(cue.excess) * math.exp(-rate * gap))
 
 
 @inlined
