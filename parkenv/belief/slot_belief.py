@@ -191,6 +191,12 @@ class SlotBelief:
         """(n_slots,) float64, s since each slot's last observation; inf if there was none."""
         return np.where(self.observed, self.time - self.observed_at.astype(np.float64), np.inf)
 
+    @property
+    def announced(self) -> FloatArray:
+        """(n_slots,) float64, P(the car shows that it leaves) beyond the usual, by the last observation of the slot."""
+        excess, rate, _ = np.asarray(self.cues, np.float64).reshape(3, -1)
+        return np.asarray(excess * np.exp(-rate * np.where(excess != 0.0, self.age, 0.0)))
+
     def take(self, slots: NDArray[np.integer]) -> Self:
         """Return the belief of some of the slots, (k,), in float64."""
         parts = self._rows[:, slots].astype(np.float64)
@@ -243,11 +249,10 @@ class SlotBelief:
         self, cues: FloatArray, slots: IntArray, taken: BoolArray, p_after: FloatArray
     ) -> FloatArray:
         """Return the excess that observations of slots leave, (k,), given P(taken) after them, (n_slots,)."""
-        excess, rate, evidence = cues[:, slots]
+        _, rate, evidence = cues[:, slots]
         usual = self.decay_rate[slots] * (1.0 - self.forecast[slots]) / rate
-        age = np.where(excess != 0.0, self.age[slots], 0.0)
         there = np.maximum(self.p_occupied[slots], _LEAST_P)
-        before = excess * np.exp(-rate * age) * p_after[slots] / there
+        before = self.announced[slots] * p_after[slots] / there
         about_to = np.clip(usual * p_after[slots] + before, 0.0, p_after[slots])
         odds = np.exp(evidence) * about_to
         return np.where(taken, odds / (odds + 1.0 - about_to) - usual * p_after[slots], 0.0)

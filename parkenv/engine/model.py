@@ -313,10 +313,9 @@ class Model:
         if not len(belief.cues):
             return np.zeros(0), np.zeros((len(rows), 0), np.bool_)
         excess, rate, _ = belief.cues.reshape(3, -1)[:, slots].astype(np.float64)
-        p = np.maximum(belief.p_occupied[slots], MIN_PROBABILITY)
         usual = belief.decay_rate[slots] * (1.0 - belief.forecast[slots]) / rate
-        age = np.where(excess != 0.0, belief.age[slots], 0.0)
-        return excess, (taken & (rng.random(taken.shape) < usual + excess * np.exp(-rate * age) / p))[rows]
+        p = usual + belief.announced[slots] / np.maximum(belief.p_occupied[slots], MIN_PROBABILITY)
+        return excess, (taken & (rng.random(taken.shape) < p))[rows]
 
     def step(
         self, state: Simulations, action: int, rng: np.random.Generator | None = None

@@ -65,6 +65,8 @@ class SearchState:
         )
         belief.time = self.time - self.arrival.time
         address = self._searches.address + self._index * SEARCH.itemsize
+        if len(self._searches.cues):
+            belief.cues = self._searches.cues[self._index].ravel()
         read_belief_at(address, belief.p_occupied, belief.p_observed, belief.observed_at)
         return belief
 

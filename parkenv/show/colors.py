@@ -28,6 +28,7 @@ PALETTE: Mapping[str, Color] = {
     "ink": (24, 27, 31),
     "white": (255, 255, 255),
     "warning": (255, 140, 90),
+    "leaving": (148, 70, 200),
     "floor": (206, 209, 212),
     "side": (255, 127, 80),
     "oblique": (120, 200, 80),

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.engine.state import SearchState
 from parkenv.show.colors import belief_colors, mixed_color
@@ -24,10 +25,11 @@ from parkenv.show.frames.lot import (
 )
 from parkenv.show.frames.window import Window
 from parkenv.show.painters.opencv import MapView, paint, write_label
-from parkenv.show.scene import DISC, Layer, Lines, cars
+from parkenv.show.scene import DISC, Layer, Lines, Marks, cars, posed
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
 
+_LIKELY = 0.25  # P(about to leave) from which a car is marked
 _KEY_WIDTH = 158  # width, px, of the colour key at the right of the line of text
 
 TEXT_WIDTH, TEXT_ROWS = 78, 17
@@ -61,7 +63,8 @@ class SearchRenderer:
             path = np.vstack([path, pose[:2]])
         paint(image, view, [fading_trail(path), *([walk(pose[:2], goal)] if state.parked else [])])
         paint_goal(image, view, goal, here)
-        around = [] if state.parked else [view_range(self.scenario, pose)]
+        around = [leaving_cars(lot, belief)]
+        around += [] if state.parked else [view_range(self.scenario, pose)]
         paint(image, view, [*around, *searching_car(pose)])
         return np.vstack([image, self._line(state)])
 
@@ -166,6 +169,12 @@ def searching_car(pose: FloatArray) -> list[Layer]:
 def view_range(scenario: Scenario, pose: FloatArray) -> Layer:
     circle = pose[:2] + 2.0 * scenario.sensor_model.view_range * DISC
     return Lines([np.vstack([circle, circle[:1]])], "white")
+
+
+def leaving_cars(lot: ParkingLot, belief: SlotBelief) -> Layer:
+    """Mark the slots whose cars are likely about to leave, by the belief."""
+    slots = np.flatnonzero(belief.announced > _LIKELY)
+    return Marks(posed(lot.slot_xy[slots]), DISC, "leaving", px=11.0, edge="white", edge_px=2.0)
 
 
 def walk(slot: FloatArray, goal: FloatArray) -> Layer:

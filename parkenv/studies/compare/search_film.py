@@ -15,7 +15,7 @@ from parkenv.show.colors import PALETTE, belief_colors, rgb
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.figures.survey import draw_detections
 from parkenv.show.frames.lot import PIXELS, LotFrames, clock, draw_belief_key, paint_goal, strip
-from parkenv.show.frames.search import car_pose, searching_car, view_range, walk
+from parkenv.show.frames.search import car_pose, leaving_cars, searching_car, view_range, walk
 from parkenv.show.painters.opencv import paint, write_text
 from parkenv.show.scene import DISC, Layer, Lines, Marks, cars, posed
 from parkenv.studies.compare.cases import Case
@@ -149,7 +149,8 @@ class SearchFilm:
             layers.append(walk(scenario.lot.slot_xy[self._moment.vertex], goal))
         paint(image, view, layers)
         paint_goal(image, view, goal, here)
-        around = [] if self._parked else [view_range(scenario, self._pose)]
+        around = [leaving_cars(scenario.lot, self._moment.belief)]
+        around += [] if self._parked else [view_range(scenario, self._pose)]
         walker_at = (
             [] if walker is None else [Marks(posed(walker), DISC, "goal", px=12.0, edge="white", edge_px=2.0)]
         )
@@ -158,6 +159,9 @@ class SearchFilm:
 
     def _seen_so_far(self) -> str:
         belief = self._moment.belief
+        if belief.announced.max(initial=0.0) > 0.5:
+            leaving = self._scenario.lot.slot_ids[int(belief.announced.argmax())]
+            return f"The car in slot {leaving} is about to leave"
         seen = belief.p_occupied[belief.observed] > 0.5
         saw = f"Its camera and laser saw {seen.sum()} taken and {(~seen).sum()} free slots"
         return saw if len(seen) else "It searches"
@@ -192,11 +196,11 @@ class SearchFilm:
                 cv2.rectangle(panel, (x, 15), (x + 13, 28), rgb(term.color), cv2.FILLED)
                 words = f"{term.label} {parts[term.field]:.0f} s"
                 x = 20 + write_text(panel, words, (x + 20, 28), "ink", 16, 500)
-        _draw_legend(panel, left)
+        _draw_legend(panel, left, self._scenario.cues is not None)
         return panel
 
 
-def _draw_legend(panel: Image, left: int) -> None:
+def _draw_legend(panel: Image, left: int, cues: bool) -> None:
     right, size = left + 300, (26.0, 12.0)
     circle = np.array([left + 412.0, 118.0]) + 18.0 * np.vstack([DISC, DISC[:1]])
     layers = [
@@ -217,6 +221,9 @@ def _draw_legend(panel: Image, left: int) -> None:
         ("the walk to the goal G", right + 38, 93),
         ("sensor range", left + 430, 123),
     ]
+    if cues:
+        paint(panel, PIXELS, [Marks(posed(np.array([left + 412.0, 148.0])), DISC, "leaving", px=11.0)])
+        words.append(("about to leave", left + 430, 153))
     for half, (text, y) in enumerate((("what the map says", 123), ("what the car has seen", 151))):
         words += [("free", left, y), (f"taken: {text}", left + 140, y)]
         panel[y - 11 : y + 1, left + 40 : left + 130] = scale[12 * half : 12 * half + 12]
