@@ -194,7 +194,9 @@ class SlotBelief:
     @property
     def announced(self) -> FloatArray:
         """(n_slots,) float64, P(the car shows that it leaves) beyond the usual, by the last observation of the slot."""
-        excess, rate, _ = np.asarray(self.cues, np.float64).reshape(3, -1)
+        if not len(self.cues):
+            return np.zeros(len(self.p_occupied))
+        excess, rate, _ = self.cues.astype(np.float64).reshape(3, -1)
         return np.asarray(excess * np.exp(-rate * np.where(excess != 0.0, self.age, 0.0)))
 
     def take(self, slots: NDArray[np.integer]) -> Self:
