@@ -22,7 +22,7 @@ from parkenv.files.atomic_write import check_writable, write_together
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.file_names import file_name
 from parkenv.files.folder_lock import only_writer
-from parkenv.files.known_names import SCENARIO_NAMES
+from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import Several, require_together
 from parkenv.show.columns import Column
@@ -54,7 +54,7 @@ _MOST_UNREAD = 20  # most rows of what could not be read that are printed
 AUTO = "auto"  # value of `--entry` and `--goal` that allows a guess
 LotName = Annotated[
     str,
-    Field(description=f"{', '.join(SCENARIO_NAMES)}, or a lot file."),
+    Field(description=f"{', '.join(PACKAGED_LOTS)}, or a lot file."),
     Option("LOT", takes="NAME|FILE", argument=True),
 ]
 Place = Annotated[
