@@ -10,8 +10,8 @@ from pathlib import Path
 from benchmarks.rows import Row
 from parkenv.lots.lot_files import PLACES
 from parkenv.scenarios.spec import lot_scenario, scenario_spec
-from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import Comparison
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.results import SPEC_FILE
 from parkenv.studies.runner import run
 

@@ -16,10 +16,9 @@ import gymnasium as gym
 import numpy as np
 
 import parkenv  # noqa: F401  registers the environments
-from parkenv.show.colors import PALETTE
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.painters.opencv import MapView, paint
-from parkenv.show.scene import DISC, Areas, Lines, LotScene, Marks, cars, posed
+from parkenv.show.scene import DISC, PALETTE, Areas, Lines, LotScene, Marks, cars, posed
 from planners import make_agent
 from planners.driving.parking import ParkingAgent
 

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from parkenv.show.plurals import interval_text
+from parkenv.show.tables import interval_text
 from parkenv.studies.benchmark.page import entries_of, neighbours, ranking, result_files
 from parkenv.studies.benchmark.suite import Suite, check_result
 

@@ -18,7 +18,7 @@ from parkenv.lots import packaged_lot, write_lot
 from parkenv.lots.town.draft import import_town
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import scenario_specs
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import record_days
 from parkenv.world.scenario import drive_times
 from planners.heuristics import POLICIES

@@ -5,8 +5,8 @@ it what planners believe. Rows come at the end, after some seconds.
 """
 
 import parkenv
-from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import rows_of
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.workers import SERIAL
 
 print("100 searches ...", flush=True)

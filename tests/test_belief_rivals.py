@@ -8,7 +8,7 @@ from parkenv import InputError, make_scenario
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.scenarios.spec import scenario_specs
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.setting import Setting
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.lot import PARK

@@ -15,7 +15,6 @@ from parkenv import InputError
 from parkenv.lots import read_lot
 from parkenv.lots.draft import combined_error_probability, read_provenance
 from parkenv.lots.lot_files import PLACES
-from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark.page import Entry, benchmark_data, precision
 from parkenv.studies.benchmark.suite import (
     CONTROLS,
@@ -27,6 +26,7 @@ from parkenv.studies.benchmark.suite import (
     worlds_of,
     write_result,
 )
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.lots import check_drivability, lot_columns
 from parkenv.studies.results import EPISODES
 from parkenv.studies.statistics import mean_over_days

@@ -14,9 +14,9 @@ from parkenv.files.spec_file import read_tables
 from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore
 from parkenv.show.figures.times import AGENT_COLORS
-from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.commute.runs import TRIP, CommuteRun, calendar
 from parkenv.studies.commute.study import Commute
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.results import DECISIONS
 from parkenv.studies.runner import run
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 from parkenv import SensorModel, make_scenario
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.show.report.tables import table_of
+from parkenv.show.tables import table_of
 from parkenv.studies.compare.cases import Case, table
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.results import DECISIONS

@@ -14,7 +14,7 @@ from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.kernel import p_full
 from parkenv.engine.records import GAVE_UP, PARKED, SEARCHING
 from parkenv.lots import grid_lot
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import policy_of
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, ListedArrivals, PoissonArrivals
 from parkenv.world.lot import PARK, ParkingLot

@@ -11,8 +11,8 @@ from stored_rows import change_rows
 from parkenv import InputError
 from parkenv.files.option import parse_call
 from parkenv.files.spec_file import read_tables
-from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.compare.comparison import Comparison
+from parkenv.studies.fields import AgentSpec, split_agents
 from parkenv.studies.results import SPEC_FILE
 from parkenv.studies.study import schemas
 

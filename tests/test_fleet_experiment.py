@@ -10,7 +10,7 @@ from parkenv import InputError, SearchProblem
 from parkenv.lots import grid_lot
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import scenario_specs
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.day import Roads, gini, random_order_search_s
 from parkenv.studies.fleet.setting import MEASURES, Setting
 from parkenv.studies.fleet.study import FleetStudy

@@ -17,7 +17,7 @@ from timetable_world import Timetable
 
 from parkenv import InputError, make_scenario
 from parkenv.show.report import page as pages
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.play import game_data
 from parkenv.world.occupancy.process import World
 from planners import make_agent

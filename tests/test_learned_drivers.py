@@ -12,7 +12,7 @@ from parkenv import InputError, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.network import compiled_network
 from parkenv.envs.sb3 import SearchVecEnv
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import network_policy, policy_of
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners import make_agent

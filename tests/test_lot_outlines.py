@@ -22,7 +22,7 @@ from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lo
 from parkenv.lots.draft import ImportOptions, Provenance, read_provenance
 from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.spaces import spaces_from_outlines
-from parkenv.show.colors import PALETTE
+from parkenv.show.scene import PALETTE
 from parkenv.studies.lots import check_drivability
 from parkenv.world.lot import Lane, ParkingLot
 

@@ -16,7 +16,7 @@ from parkenv.errors import InputError
 from parkenv.lots import write_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import demand_in, record_days
 from parkenv.world.arrivals import Headways, NoArrivals, PoissonArrivals, follow_counts
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, LogNormalTime, TownDemand

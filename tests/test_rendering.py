@@ -10,9 +10,9 @@ from gymnasium.utils.env_checker import check_env
 import parkenv  # noqa: F401  (registers the environments)
 from parkenv import make_scenario
 from parkenv.lots import city_lot
-from parkenv.show.colors import PALETTE, belief_colors
 from parkenv.show.frames.search import SearchRenderer
 from parkenv.show.frames.window import Window
+from parkenv.show.scene import PALETTE, belief_colors
 from parkenv.world.lot import PARK, Lane, ParkingLot
 from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 

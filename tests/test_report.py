@@ -14,7 +14,7 @@ from parkenv import InputError, make_scenario
 from parkenv.cli.report import make_report
 from parkenv.files.known_names import UNBEATEN
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.show.report.tables import table_of
+from parkenv.show.tables import table_of
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.search_replay import Encounter, choose, replay
 from parkenv.studies.report import RunFolder

@@ -8,10 +8,9 @@ from matplotlib.figure import Figure
 from pictures import shows_color
 
 from parkenv.lots import packaged_lot
-from parkenv.show.colors import PALETTE
 from parkenv.show.painters import axes, opencv
 from parkenv.show.painters.opencv import MapView
-from parkenv.show.scene import SQUARE, Areas, Lines, LotScene, Marks
+from parkenv.show.scene import PALETTE, SQUARE, Areas, Lines, LotScene, Marks
 
 
 def polygons(paved):

@@ -12,8 +12,8 @@ from parkenv import InputError, ParkingLot, fleet, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import AgentsByStay, policy_of
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from parkenv.show.plurals import interval_text
+from parkenv.show.tables import interval_text
 
 HERE = Path(__file__).resolve().parent
 TWINS = {

@@ -19,7 +19,7 @@ import numpy as np
 from held_out import WORLDS, make
 
 import parkenv
-from parkenv.show.plurals import interval_text
+from parkenv.show.tables import interval_text
 from parkenv.studies.statistics import mean_interval
 
 HERE = Path(__file__).resolve().parent

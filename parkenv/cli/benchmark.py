@@ -10,8 +10,7 @@ from parkenv.files.atomic_write import make_folder
 from parkenv.files.known_names import SuiteName
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several
-from parkenv.show.columns import Column, shared
-from parkenv.show.plurals import plural
+from parkenv.show.tables import Column, plural, shared
 from parkenv.studies.benchmark.study import score_table
 
 

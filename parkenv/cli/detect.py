@@ -14,8 +14,7 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import option
 from parkenv.files.spec_file import DetectorName, Several, require_together
-from parkenv.show.columns import Column
-from parkenv.show.plurals import plural
+from parkenv.show.tables import Column, plural
 from parkenv.studies.fields import Seed
 from parkenv.studies.study import counted
 

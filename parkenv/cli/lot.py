@@ -25,8 +25,7 @@ from parkenv.files.folder_lock import only_writer
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import Several, require_together
-from parkenv.show.columns import Column
-from parkenv.show.plurals import plural
+from parkenv.show.tables import Column, plural
 from parkenv.world.tariff import NO_ZONE
 
 if TYPE_CHECKING:

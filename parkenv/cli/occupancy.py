@@ -22,10 +22,8 @@ from parkenv.scenarios.spec import (
     Date,
     scenario_spec,
 )
-from parkenv.show.columns import Column
-from parkenv.show.plurals import plural
-from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fields import OneAgent, OneScenario, Seed
+from parkenv.show.tables import Column, plural
+from parkenv.studies.fields import AgentSpec, OneAgent, OneScenario, Seed
 from parkenv.studies.fleet.setting import COLUMNS
 
 if TYPE_CHECKING:

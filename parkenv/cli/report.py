@@ -19,8 +19,7 @@ from parkenv.files.option import Inside, Option, option
 from parkenv.files.spec_file import Spec
 from parkenv.files.user_class import find_module
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.studies.agent_spec import AgentSpec, classes_in
-from parkenv.studies.fields import TRAFFIC, Agents, OneScenario, Seed
+from parkenv.studies.fields import TRAFFIC, Agents, AgentSpec, OneScenario, Seed, classes_in
 from parkenv.studies.study import ExecutionSpec, ReportOptions
 
 Trust = Annotated[

@@ -19,9 +19,7 @@ from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.files.spec_file import Axis, Several
 from parkenv.mapping.recordings.photo_options import PhotoOptions
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.columns import Column
-from parkenv.show.plurals import plural
-from parkenv.show.report.tables import table_of
+from parkenv.show.tables import Column, plural, table_of
 from parkenv.studies.fields import PRICES, TRAFFIC, Detector, OneScenario, Scenarios, Seed, with_traffic
 from parkenv.studies.sensing.survey_study import COLUMNS
 from parkenv.studies.study import ExecutionSpec, counted
@@ -91,8 +89,7 @@ class MapDrive(Command):
         from parkenv.mapping.recordings.calibration import DriveCalibration
         from parkenv.perception.detector_registry import make_detector
         from parkenv.scenarios.build import build
-        from parkenv.studies.sensing.recorded_session import DriveReader, add_recording
-        from parkenv.studies.sensing.street_discovery import discover_recordings
+        from parkenv.studies.sensing.recorded_session import DriveReader, add_recording, discover_recordings
 
         require(
             not (self.discover and self.scenario), "--discover makes a lot; want no --lot and no --scenario"

@@ -17,13 +17,11 @@ from parkenv.files.folder_lock import only_writer
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.columns import SETTING_AXES
-from parkenv.show.plurals import plural
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.show.tables import SETTING_AXES, plural
 from parkenv.studies.compare.comparison import Grid
 from parkenv.studies.demo.study import FILM, QUICK
 from parkenv.studies.demo.study import Demo as DemoStudy
-from parkenv.studies.fields import TRAFFIC, OneAgent, OneScenario, Scenarios, Seed
+from parkenv.studies.fields import TRAFFIC, AgentSpec, OneAgent, OneScenario, Scenarios, Seed
 from parkenv.studies.results import PAGE
 from parkenv.studies.sensing.survey_study import SHOWN, SurveyStudy
 from parkenv.studies.study import ReportOptions

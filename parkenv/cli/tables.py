@@ -12,7 +12,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 from parkenv.files.file_names import is_plain
-from parkenv.show.report.tables import part_of, table_of, written
+from parkenv.show.tables import part_of, table_of, written
 from parkenv.studies.results import write_summary
 from parkenv.version import __version__
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
     from rich.table import Table
 
-    from parkenv.show.columns import Column
+    from parkenv.show.tables import Column
 
 WIDE = 1000  # width assumed if output goes to a file or a pipe, characters: no column of a table is cut there
 
@@ -76,7 +76,7 @@ def print_rows(
 
 
 def print_table(console: Console, table: Mapping[str, Any]) -> None:
-    """Print a table of `parkenv.show.report.tables.table_of`, or the first `MOST_ROWS` of its rows.
+    """Print a table of `parkenv.show.tables.table_of`, or the first `MOST_ROWS` of its rows.
 
     What is equal in all rows, and not 0, stands above the table. A narrow terminal gets several tables, each of which
     begins with the columns that name the rows.

@@ -32,7 +32,7 @@ from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout
 from parkenv.engine.state import SearchState
 from parkenv.errors import InputError, require, require_number, require_one_of, require_whole, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
-from parkenv.show.plurals import plural
+from parkenv.show.tables import plural
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.process import raise_error

@@ -27,7 +27,7 @@ from parkenv.lots.generators import nearest_on_lanes
 from parkenv.lots.lot_files import dead_ends
 from parkenv.lots.osm.draft import import_car_parks
 from parkenv.show.figures.lots import save_census, save_contact_sheets
-from parkenv.show.plurals import plural
+from parkenv.show.tables import plural
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
 from parkenv.world.drive_graph import linestrings

@@ -18,7 +18,7 @@ from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
 from parkenv.forecast.slot_comparison import ComparedSlots, compare_slot_days
 from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 from parkenv.show.figures.forecast import save_forecast, save_rates, shown_counts, shown_slots, shown_week
-from parkenv.show.plurals import plural
+from parkenv.show.tables import plural
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
 from parkenv.world.occupancy.fit import fit_process

@@ -14,8 +14,8 @@ from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import require
 from parkenv.show.report.page import terms_data
 from parkenv.show.scene import LotScene
-from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, require_distinct
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.simulate import STEP_LIMIT, Observer, Step
 from parkenv.studies.study import AGREES_S, MOST_SLOTS, Progress
 from parkenv.world.occupancy.process import World

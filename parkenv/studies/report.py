@@ -14,7 +14,7 @@ from parkenv.files.atomic_write import make_folder
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.show.report.page import Page, page_data, write_page
-from parkenv.show.report.tables import tables_of
+from parkenv.show.tables import tables_of
 from parkenv.studies.results import PAGE, SETTINGS, SPEC_FILE, SUMMARY, SUMMARY_PARTIAL, require_unchanged
 from parkenv.studies.study import (
     STUDIES,

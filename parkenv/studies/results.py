@@ -19,7 +19,7 @@ from parkenv.files.csv_tables import csv_columns, csv_text, write_csv
 from parkenv.files.limited_reading import parse_json, read_json
 from parkenv.files.row_file import RowFile, to_json
 from parkenv.files.spec_file import Spec
-from parkenv.show.columns import SETTING_AXES
+from parkenv.show.tables import SETTING_AXES
 from parkenv.studies.workers import SERIAL
 from parkenv.version import __version__
 from parkenv.world.cost_terms import COST_FIELDS

@@ -24,7 +24,7 @@ from parkenv.errors import InputError, require
 from parkenv.files.folder_lock import only_writer
 from parkenv.files.limited_reading import read_json
 from parkenv.files.user_class import failure_of
-from parkenv.studies.agent_spec import classes_in
+from parkenv.studies.fields import classes_in
 from parkenv.studies.results import SETTINGS, SPEC_FILE, SUMMARY, Key, Results, Row
 from parkenv.studies.study import Progress, Stage, Study, read_study, run_tasks
 from parkenv.studies.workers import Workers

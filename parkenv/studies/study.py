@@ -21,8 +21,8 @@ from parkenv.files.known_names import BackendName
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.show.report.tables import part_of, tables_of
-from parkenv.studies.agent_spec import split_agents
+from parkenv.show.tables import part_of, tables_of
+from parkenv.studies.fields import split_agents
 from parkenv.studies.results import (
     EPISODES,
     Key,
@@ -33,8 +33,8 @@ from parkenv.studies.results import (
 from parkenv.studies.workers import Task, Workers
 
 if TYPE_CHECKING:
-    from parkenv.show.columns import Column
     from parkenv.show.report.page import Page
+    from parkenv.show.tables import Column
     from parkenv.studies.runner import Result
 
 STUDIES: Mapping[str, str] = {

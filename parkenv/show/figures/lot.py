@@ -23,10 +23,20 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.drivable_area import JOINED_WHOLE
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.show.colors import BELIEF_ANCHORS, hex_color
 from parkenv.show.figures.picture_files import STYLE
 from parkenv.show.painters.axes import draw_scale_bar, paint, points_per_m
-from parkenv.show.scene import ARROWHEAD, DISC, STAR, Layer, Lines, LotScene, Marks, posed
+from parkenv.show.scene import (
+    ARROWHEAD,
+    BELIEF_ANCHORS,
+    DISC,
+    STAR,
+    Layer,
+    Lines,
+    LotScene,
+    Marks,
+    hex_color,
+    posed,
+)
 from parkenv.world.lot import ParkingLot
 from parkenv.world.tariff import NO_ZONE
 

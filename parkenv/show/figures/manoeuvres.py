@@ -15,12 +15,11 @@ from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.scene import Scene
 from parkenv.driving.vehicle import STATE_SIZE, placed
 from parkenv.files.atomic_write import atomic_write
-from parkenv.show.colors import FREE, mixed_color
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.frames.drive import LARGEST_SCALE, steered_car, trail
 from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, painted_finely, strip, write_line
 from parkenv.show.painters.opencv import MapView, paint
-from parkenv.show.scene import Areas, Layer, Lines
+from parkenv.show.scene import FREE, Areas, Layer, Lines, mixed_color
 
 FPS, SPEED_UP, COLORS = 10, 4, 64
 """Frames per second of a film, how much faster than real it is, and its colours."""

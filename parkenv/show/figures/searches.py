@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 
 from parkenv.engine.search_record import SearchRecord
 from parkenv.errors import InputError
-from parkenv.show.colors import hex_color
 from parkenv.show.figures.charts import key_line
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE
 from parkenv.show.painters.axes import paint, points_per_m
-from parkenv.show.plurals import plural
-from parkenv.show.scene import ARROWHEAD, LANE_ARROW, Layer, Lines, Marks, posed, poses_on
+from parkenv.show.scene import ARROWHEAD, LANE_ARROW, Layer, Lines, Marks, hex_color, posed, poses_on
+from parkenv.show.tables import plural
 from parkenv.world.cost_terms import COST_TERMS
 from parkenv.world.lot import PARK, ParkingLot
 from parkenv.world.scenario import KMH

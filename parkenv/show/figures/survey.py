@@ -24,14 +24,13 @@ from parkenv.mapping.odometry import between, moved
 from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import LEAST_PROBABILITY, PROBABILITY, Detections
 from parkenv.perception.range_scan import disparity
-from parkenv.show.colors import PALETTE, Color, hex_color
 from parkenv.show.figures.charts import Line, Panel, Row, draw_panels, key_line
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, picture, save_picture
 from parkenv.show.painters.axes import paint
 from parkenv.show.painters.opencv import write_tag
-from parkenv.show.plurals import plural, slots_text
-from parkenv.show.scene import DISC, Layer, Lines, Marks, posed
+from parkenv.show.scene import DISC, PALETTE, Color, Layer, Lines, Marks, hex_color, posed
+from parkenv.show.tables import plural, slots_text
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import VehicleBoxes, View
 from sim_sensors.rig import Capture, SensorRig

@@ -19,7 +19,6 @@ from matplotlib.ticker import MaxNLocator
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.known_names import UNBEATEN
-from parkenv.show.columns import SETTING_AXES
 from parkenv.show.figures.charts import (
     BOLD,
     COLORS,
@@ -34,7 +33,7 @@ from parkenv.show.figures.charts import (
     spread,
 )
 from parkenv.show.figures.picture_files import INK, STYLE, picture, save_picture
-from parkenv.show.plurals import LEAST_SEARCHES, plural
+from parkenv.show.tables import LEAST_SEARCHES, SETTING_AXES, plural
 from parkenv.world.cost_terms import COST_TERMS
 
 AGENT_COLORS = {

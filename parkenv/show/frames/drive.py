@@ -13,12 +13,22 @@ from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.parking_task import REACH, DriveState, ParkingTask
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, placed
-from parkenv.show.colors import FREE, mixed_color
 from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, painted_finely, strip, write_line
 from parkenv.show.frames.window import Window
 from parkenv.show.painters.opencv import MapView, paint
-from parkenv.show.plurals import plural
-from parkenv.show.scene import SQUARE, Areas, Layer, Lines, LotScene, Marks, building_layers, cars
+from parkenv.show.scene import (
+    FREE,
+    SQUARE,
+    Areas,
+    Layer,
+    Lines,
+    LotScene,
+    Marks,
+    building_layers,
+    cars,
+    mixed_color,
+)
+from parkenv.show.tables import plural
 from parkenv.world.lot import ParkingLot, corner_points
 
 LARGEST_SCALE = 26.0  # px/m

@@ -6,11 +6,10 @@ import numpy as np
 
 from parkenv.compiled.arrays import Image
 from parkenv.engine.fleet import Fleet
-from parkenv.show.colors import Color
 from parkenv.show.frames.lot import HUD, HUD_MARGIN, PIXELS, LotFrames, clock, paint_goal, strip, write_line
 from parkenv.show.frames.window import Window
 from parkenv.show.painters.opencv import paint, text_width, write_label
-from parkenv.show.scene import DISC, Marks, cars, posed
+from parkenv.show.scene import DISC, Color, Marks, cars, posed
 
 SLOT: Color = (126, 130, 136)
 SIZE = (4.4, 1.85)  # of a car, m

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.compiled.jit import compiled
-from parkenv.show.colors import BELIEF_SCALE, PALETTE, Color
 from parkenv.show.painters.opencv import (
     SUBPIXEL_BITS,
     SUPERSAMPLING,
@@ -25,11 +24,14 @@ from parkenv.show.painters.opencv import (
 )
 from parkenv.show.scene import (
     ARROWHEAD,
+    BELIEF_SCALE,
     CAR_BODY,
     DISC,
+    PALETTE,
     REAR_WINDOW,
     SQUARE,
     WINDSCREEN,
+    Color,
     Layer,
     LotScene,
     Marks,

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.engine.state import SearchState
-from parkenv.show.colors import belief_colors, mixed_color
 from parkenv.show.frames.lot import (
     HUD,
     HUD_MARGIN,
@@ -25,7 +24,7 @@ from parkenv.show.frames.lot import (
 )
 from parkenv.show.frames.window import Window
 from parkenv.show.painters.opencv import MapView, paint, write_label
-from parkenv.show.scene import DISC, Layer, Lines, Marks, cars, posed
+from parkenv.show.scene import DISC, Layer, Lines, Marks, belief_colors, cars, mixed_color, posed
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
 

@@ -12,8 +12,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.patheffects import Normal, Stroke
 
-from parkenv.show.colors import PALETTE
-from parkenv.show.scene import HALO_PX, Areas, Layer, Lines, Paint, Rings, placed_shape
+from parkenv.show.scene import HALO_PX, PALETTE, Areas, Layer, Lines, Paint, Rings, placed_shape
 
 _STEP = 0.01
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, Image
-from parkenv.show.colors import PALETTE, Color, rgb
-from parkenv.show.scene import HALO_PX, Areas, Layer, Lines, Marks, Paint, placed_shape
+from parkenv.show.scene import HALO_PX, PALETTE, Areas, Color, Layer, Lines, Marks, Paint, placed_shape, rgb
 
 SUBPIXEL_BITS = 4
 SUPERSAMPLING = 4

@@ -13,9 +13,8 @@ from scipy.special import ndtri
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.show.columns import Column, shared
 from parkenv.show.report.page import Page, page_data
-from parkenv.show.report.tables import table_of
+from parkenv.show.tables import Column, shared, table_of
 from parkenv.studies.benchmark.study import RESULT, Benchmark, score_table
 from parkenv.studies.benchmark.suite import Suite, mean_time, score_interval
 from parkenv.studies.results import Row

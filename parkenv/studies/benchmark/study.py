@@ -12,11 +12,9 @@ from pydantic import Field
 from parkenv.files.known_names import SuiteName
 from parkenv.files.limited_reading import read_json
 from parkenv.files.option import Inside, Option, option
-from parkenv.show.columns import Column, shared
-from parkenv.show.report.tables import spread, table_of
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.show.tables import Column, shared, spread, table_of
 from parkenv.studies.compare.comparison import CaseStudy
-from parkenv.studies.fields import Agents, ScenarioItem, one_word
+from parkenv.studies.fields import Agents, AgentSpec, ScenarioItem, one_word
 from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell
 from parkenv.studies.workers import Task

@@ -39,9 +39,9 @@ from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.build import build, make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, at_occupancy, check_worlds, require_distinct, table
 from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.results import SETTING_COLUMNS, Key, Row, decision_s, without_nan
 from parkenv.studies.statistics import (
     Estimate,

@@ -22,8 +22,8 @@ from parkenv.files.file_names import file_name
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.trips import Trip
-from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner, TripRecorder
+from parkenv.studies.fields import AgentSpec, label_of
 from parkenv.studies.results import Row, timed_row
 from parkenv.studies.statistics import columns_of, mean_interval, trimmed_mean_interval
 from parkenv.world.occupancy.arrival_window import ArrivalWindow

@@ -17,10 +17,10 @@ from parkenv.files.known_names import MapName
 from parkenv.files.option import option
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.columns import Column, shared
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.show.tables import Column, shared
 from parkenv.studies.fields import (
     Agents,
+    AgentSpec,
     Figures,
     Scenarios,
     Seed,
@@ -215,7 +215,7 @@ class Commute(Study):
 
     @classmethod
     def printed(cls, summary: Row, folder: Path) -> list[Row]:
-        from parkenv.show.report.tables import spread, table_of
+        from parkenv.show.tables import spread, table_of
 
         del folder
         weeks, tables = summary["weeks"], []

@@ -17,8 +17,8 @@ from parkenv.engine.search_record import SearchRecord
 from parkenv.errors import InputError, require
 from parkenv.files.known_names import UNBEATEN
 from parkenv.scenarios.selection import seeds_by_scenario
-from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.fields import AgentSpec, label_of
 from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s
 from parkenv.studies.statistics import (
     LEAST_PAIRS,

@@ -16,13 +16,12 @@ from parkenv.files.known_names import UNBEATEN
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, Spec
 from parkenv.scenarios.spec import Cost, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
-from parkenv.show.columns import SETTING_AXES
-from parkenv.show.plurals import plural
-from parkenv.studies.agent_spec import AgentSpec, split_agents
+from parkenv.show.tables import SETTING_AXES, plural
 from parkenv.studies.fields import (
     AGENTS_HELP,
     MAX_EPISODES,
     Agents,
+    AgentSpec,
     Detector,
     Figures,
     Level,
@@ -33,6 +32,7 @@ from parkenv.studies.fields import (
     require_at_most,
     require_distinct_names,
     require_rig,
+    split_agents,
 )
 from parkenv.studies.results import Results, Row, search_settings
 from parkenv.studies.study import Cell, ReplayJob, ReportOptions, Study

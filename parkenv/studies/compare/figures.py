@@ -15,10 +15,10 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import UNBEATEN
 from parkenv.scenarios.selection import BLIND
-from parkenv.show.columns import SETTING_AXES
 from parkenv.show.figures import times
 from parkenv.show.figures.picture_files import save_picture
 from parkenv.show.figures.searches import draw_searches
+from parkenv.show.tables import SETTING_AXES
 from parkenv.studies.compare.cases import Case, against_occupancy
 from parkenv.world.scenario import KMH
 

@@ -11,13 +11,12 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.engine.search_record import Moment, SearchRecord
-from parkenv.show.colors import PALETTE, belief_colors, rgb
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.figures.survey import draw_detections
 from parkenv.show.frames.lot import PIXELS, LotFrames, clock, draw_belief_key, paint_goal, strip
 from parkenv.show.frames.search import car_pose, leaving_cars, searching_car, view_range, walk
 from parkenv.show.painters.opencv import paint, write_text
-from parkenv.show.scene import DISC, Layer, Lines, Marks, cars, posed
+from parkenv.show.scene import DISC, PALETTE, Layer, Lines, Marks, belief_colors, cars, posed, rgb
 from parkenv.studies.compare.cases import Case
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 from parkenv.world.lot import PARK

@@ -26,7 +26,7 @@ from parkenv.errors import InputError, nearest, with_extra
 from parkenv.files.atomic_write import write_text
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.limited_reading import read_json
-from parkenv.show.columns import Column
+from parkenv.show.tables import Column
 from parkenv.studies.curve.zones import INDEX, LONE, OF_CARS, STATE, SUMS, Zones
 from parkenv.studies.fleet.day import ALL
 from parkenv.studies.results import Row, Table, without_nan

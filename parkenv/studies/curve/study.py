@@ -14,9 +14,7 @@ from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.columns import Column
-from parkenv.show.plurals import plural
-from parkenv.show.report.tables import tables_of
+from parkenv.show.tables import Column, plural, tables_of
 from parkenv.studies.fields import TRAFFIC, ScenarioList, Values
 from parkenv.studies.fleet.setting import COLUMNS, OWN, SETTING_COLUMNS, Demanded, times_demanded
 from parkenv.studies.fleet.study import FleetSpec

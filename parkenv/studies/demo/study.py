@@ -13,7 +13,7 @@ from pydantic import Field
 from parkenv.files.known_names import RigName
 from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.plurals import plural
+from parkenv.show.tables import plural
 from parkenv.studies.compare.comparison import CaseStudy, Comparison
 from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, OneScenario, Seed
 from parkenv.studies.results import EPISODES, Results, Row, Table, fingerprints, flat_tables

@@ -14,7 +14,7 @@ from parkenv.forecast.comparison import last_week
 from parkenv.forecast.counts import Counts
 from parkenv.scenarios.build import build, demand_of
 from parkenv.scenarios.spec import PurposeSpec, ScenarioSpec
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import compiled_policy_of
 from parkenv.studies.results import Row, without_nan
 from parkenv.world.arrivals import STAYS_H, follow_counts, hours_between

@@ -14,10 +14,8 @@ from parkenv.errors import InputError
 from parkenv.files.option import option
 from parkenv.files.spec_file import FilePath
 from parkenv.scenarios.spec import TIMEZONE_HELP, Date, PurposeSpec, scenario_spec
-from parkenv.show.columns import Column
-from parkenv.show.plurals import plural
-from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fields import OneAgent, OneScenario, Seed
+from parkenv.show.tables import Column, plural
+from parkenv.studies.fields import AgentSpec, OneAgent, OneScenario, Seed
 from parkenv.studies.results import Results, Row, Table, search_settings
 from parkenv.studies.study import Cell, Stage, Study, counted
 from parkenv.world.week import HOUR_S

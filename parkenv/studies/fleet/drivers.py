@@ -21,7 +21,7 @@ from parkenv.files.atomic_write import atomic_write
 from parkenv.files.known_names import SAME_SLOTS
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.setting import COUNTED, GIVEN, times_demanded
 from parkenv.studies.study import Progress
 from parkenv.world.demand import (

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, WithJsonSchema
 
-from parkenv.show.columns import Column, shared
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.show.tables import Column, shared
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.results import Row
 from parkenv.world.cost_terms import COST_FIELDS
 

@@ -20,10 +20,10 @@ from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
 from parkenv.files.option import option, words_in
 from parkenv.files.spec_file import Axis, FilePath
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.plurals import plural
-from parkenv.studies.agent_spec import AgentSpec, split_agents
+from parkenv.show.tables import plural
 from parkenv.studies.fields import (
     Agents,
+    AgentSpec,
     Figures,
     MeanStay,
     Patience,
@@ -33,6 +33,7 @@ from parkenv.studies.fields import (
     listed,
     require_at_most,
     require_distinct_names,
+    split_agents,
 )
 from parkenv.studies.fleet.setting import (
     BY_HOUR,

@@ -14,9 +14,7 @@ from parkenv.files.option import Inside, option
 from parkenv.files.spec_file import Several
 from parkenv.mapping.odometry import PoseNoise
 from parkenv.scenarios.spec import Hours, scenario_spec
-from parkenv.show.columns import Column, shared
-from parkenv.show.plurals import plural, slots_text
-from parkenv.show.report.tables import table_of
+from parkenv.show.tables import Column, plural, shared, slots_text, table_of
 from parkenv.studies.fields import PRICES, CaptureDistance, Detector, OneScenario, Seed, with_traffic
 from parkenv.studies.results import SETTINGS, Key, Results, Row, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS

@@ -16,7 +16,7 @@ from parkenv.mapping.inference import Prediction, SessionLog, predict
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
-from parkenv.show.plurals import plural
+from parkenv.show.tables import plural
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, MAP_FILE, SESSION_COLUMNS
 from parkenv.studies.statistics import success_columns

@@ -15,9 +15,17 @@ from parkenv.files.limited_reading import read_json
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.files.spec_file import Several, require_together
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.columns import Column, shared
-from parkenv.studies.agent_spec import AgentItem, split_agents
-from parkenv.studies.fields import MAX_EPISODES, SCENARIOS_TAKE, Level, ScenarioList, Scenarios, Seed
+from parkenv.show.tables import Column, shared
+from parkenv.studies.fields import (
+    MAX_EPISODES,
+    SCENARIOS_TAKE,
+    AgentItem,
+    Level,
+    ScenarioList,
+    Scenarios,
+    Seed,
+    split_agents,
+)
 from parkenv.studies.results import PAGE, SUMMARY, Row, Table, without_nan
 from parkenv.studies.study import Cell, ReplayJob, ReportOptions, Stage, Study
 from parkenv.studies.training.curve_file import CURVE, read_curve

@@ -39,16 +39,16 @@ from parkenv.scenarios.selection import (
     split_by_lot,
 )
 from parkenv.show.figures.times import save_learning_curves
-from parkenv.show.plurals import plural
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.show.tables import plural
 from parkenv.studies.compare.cases import Case, rows_of
 from parkenv.studies.compare.search_replay import search_replay
-from parkenv.studies.results import Results, fingerprints, flat_tables
+from parkenv.studies.fields import AgentSpec
+from parkenv.studies.results import Results, Row, fingerprints, flat_tables
 from parkenv.studies.simulate import EpisodeResult, Observer, Step, charge_truncation, simulate
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.study import Progress, ReplayJob, ReportOptions
 from parkenv.studies.training.configs import MAX_STEPS, REWARD_SCALE, SEARCH_CONFIGS, TrainingConfig
-from parkenv.studies.training.curve_file import CURVE, Row, read_curve
+from parkenv.studies.training.curve_file import CURVE, read_curve
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent

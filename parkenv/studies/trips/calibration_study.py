@@ -14,9 +14,8 @@ from parkenv.files.file_names import file_name
 from parkenv.files.known_names import OBSERVED, UNOBSERVED
 from parkenv.files.option import option
 from parkenv.scenarios.spec import Speed, scenario_spec
-from parkenv.show.plurals import plural
-from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, Vehicle, require_rig
+from parkenv.show.tables import plural
+from parkenv.studies.fields import AgentSpec, Detector, OneAgent, OneScenario, Rig, Seed, Vehicle, require_rig
 from parkenv.studies.results import Results, Row, Table, search_settings
 from parkenv.studies.study import Cell, Labelled, Study
 from parkenv.studies.workers import Task

@@ -22,7 +22,7 @@ from parkenv.envs.search import SearchEnv
 from parkenv.errors import require, require_whole
 from parkenv.files.known_names import OBSERVED
 from parkenv.scenarios.calibration import Calibration
-from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import AgentSpec
 from parkenv.studies.results import Row
 from parkenv.studies.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.studies.statistics import columns_of, mean_interval

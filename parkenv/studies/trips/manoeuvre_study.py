@@ -17,7 +17,7 @@ from parkenv.errors import require
 from parkenv.files.known_names import SCENE_LEVELS
 from parkenv.files.option import option, words_in
 from parkenv.files.spec_file import Axis
-from parkenv.show.columns import Column
+from parkenv.show.tables import Column
 from parkenv.studies.fields import Figures, Seed, Vehicle
 from parkenv.studies.results import Results, Row, Table, fingerprints
 from parkenv.studies.study import Cell, Labelled, Study
