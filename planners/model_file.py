@@ -34,8 +34,8 @@ from planners.names import ALGORITHMS
 SUFFIX = ".safetensors"
 CARD_KEY = "parkenv"  # key of the card in the metadata
 _MAX_HEADER = 1_000_000
+# Version of the layout of `parkenv.engine.local_observation`, which search models observe.
 OBSERVATION = "local-1"
-"""Version of the layout of `parkenv.engine.local_observation`, which search models observe."""
 _MAX_BYTES = 500_000_000
 _MAX_WEIGHT = 1e6  # products of larger ones over several layers could overflow
 _ZIP = b"PK"

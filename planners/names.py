@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 EXPECTS_RIVALS = "belief-rivals"  # the agent with the option `arrivals_per_hour`: rivals an hour
+# Module and class of each agent; modules are imported when an agent is made.
 AGENTS: dict[str, tuple[str, str]] = {
     "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
     "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
@@ -21,19 +22,18 @@ AGENTS: dict[str, tuple[str, str]] = {
     "exact": ("planners.bounds.exact", "ExactAgent"),
     "bound": ("planners.bounds.relaxation", "SearchBound"),
 }
-"""Module and class of each agent; modules are imported when an agent is made."""
+# Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model.
 ALGORITHMS = {
     "dqn": ("stable_baselines3", "DQN"),
     "ppo": ("stable_baselines3", "PPO"),
     "maskable-ppo": ("sb3_contrib", "MaskablePPO"),
     "recurrent-ppo": ("sb3_contrib", "RecurrentPPO"),
 }
-"""Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
 NETWORK = "network"  # the agent whose weights can be another file: `network:FILE`
 HUMAN = "human"  # the agent that repeats what a person did in a game of `parkenv play`: `human:FILE`
 FILE_AGENTS = (*ALGORITHMS, NETWORK, HUMAN)  # names before the colon of `NAME:FILE`
+# Agents that make no use of an occupancy forecast.
 WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "greedy-total", "first-free", "random", "oracle")
-"""Agents that make no use of an occupancy forecast."""
 SMALL_LOTS_ONLY = ("exact",)  # agents for small lots and sensors without errors only
 BOUND = "bound"  # what no agent can beat in the mean; it drives no car
 AGENT_NAMES = tuple(name for name in AGENTS if name not in (*SMALL_LOTS_ONLY, BOUND))  # agents for all lots

@@ -20,8 +20,8 @@ from planners.routes import RoadTable
 from planners.thesis.label_setting import StoppingGraph, set_labels
 from planners.thesis.mdp import ParkingMDP
 
+# Default maximum number of vertices of a subgraph. The table of drives grows with its square and takes 40 MB.
 MOST_VERTICES = 2000
-"""Default maximum number of vertices of a subgraph. The table of drives grows with its square and takes 40 MB."""
 _LEAST_VERTICES = 16
 _KEPT = 4
 

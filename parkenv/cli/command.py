@@ -83,8 +83,8 @@ COMPLETERS: dict[str, Completer] = {
 }
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+# Headings of options on help pages, in their order; others stand before World.
 PANELS = ("Options", "Costs and speeds", "World", "Sensors", "Results", "Trust", "Machines")
-"""Headings of options on help pages, in their order; others stand before World."""
 
 
 class Entry(NamedTuple):

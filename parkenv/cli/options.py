@@ -23,8 +23,8 @@ SpecT = TypeVar("SpecT", bound=Spec)
 _LETTERS = {int: "N", float: "X", Path: "FILE"}
 
 
+# What was given for each option, such as `--episodes`: text, a tuple of texts, or for switches a bool.
 Given = Mapping[str, Any]
-"""What was given for each option, such as `--episodes`: text, a tuple of texts, or for switches a bool."""
 
 
 class Command(Spec):

@@ -11,14 +11,14 @@ from contextlib import contextmanager
 from importlib.machinery import ExtensionFileLoader, SourceFileLoader
 from types import FrameType
 
+# Functions of importlib that import a compiled module, and that read a file of a module in Python.
 _IMPORTS = (
     ExtensionFileLoader.create_module.__code__,
     ExtensionFileLoader.exec_module.__code__,
     SourceFileLoader.get_data.__code__,
 )
-"""Functions of importlib that import a compiled module, and that read a file of a module in Python."""
+# Functions of numba and llvmlite that compiled code calls: for the result of a function, and while LLVM compiles.
 _CALLED_BY_NUMBA = {"_numba_unpickle", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
-"""Functions of numba and llvmlite that compiled code calls: for the result of a function, and while LLVM compiles."""
 
 
 def unsafe_to_raise(frame: FrameType | None) -> bool:

@@ -106,11 +106,11 @@ class Demo(StudyCommand):
 
 
 SHOWN_ROWS = 20
+# Columns of parkings on lots that are printed.
 SHOWN_OF_PARKINGS = (
     "agent", "kind", "way", "parked", "success", "contacts", "planning_ms", "planning_ms_p95", "time_s", "time_s_p95",
     "direction_changes", "direction_changes_p95", "driven_m", "turned_rad",
 )  # fmt: skip
-"""Columns of parkings on lots that are printed."""
 _TASKS = "Parking tasks"
 
 

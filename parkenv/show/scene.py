@@ -51,6 +51,7 @@ PALETTE: Mapping[str, Color] = {
 Pages have their own values, for light and dark themes, in `report/style.css`.
 """
 
+# Colours of P(taken) = 0, 1/4, 1/2, 3/4, 1: greenish to red, distinguishable with any colour vision.
 BELIEF_ANCHORS: tuple[Color, ...] = (
     (0, 128, 115),
     (106, 190, 170),
@@ -58,7 +59,6 @@ BELIEF_ANCHORS: tuple[Color, ...] = (
     (240, 150, 95),
     (192, 50, 25),
 )
-"""Colours of P(taken) = 0, 1/4, 1/2, 3/4, 1: greenish to red, distinguishable with any colour vision."""
 FREE: Color = BELIEF_ANCHORS[0]
 
 _PALENESS = 0.62
@@ -88,8 +88,8 @@ def _belief_scale() -> Image:
     return np.round(np.stack([pale, full])).astype(np.uint8)
 
 
+# Colours, (2, 256, 3) uint8, of P(taken) = i/255: unobserved slots, then observed ones.
 BELIEF_SCALE = _belief_scale()
-"""Colours, (2, 256, 3) uint8, of P(taken) = i/255: unobserved slots, then observed ones."""
 
 
 def belief_colors(p_occupied: NDArray[np.floating], seen: NDArray[np.bool_]) -> Image:
@@ -98,17 +98,17 @@ def belief_colors(p_occupied: NDArray[np.floating], seen: NDArray[np.bool_]) -> 
 
 
 Rings = Sequence[FloatArray]  # A polygon, m: its outer ring, (k, 2), and its holes
+# A name in `PALETTE`, "#rrggbb" or RGB; or one for each shape, also as (n, 3) RGB in 0..1 (figures only).
 Paint = str | Color | Sequence[str] | Sequence[Color] | FloatArray
-"""A name in `colors.PALETTE`, "#rrggbb" or RGB; or one for each shape, also as (n, 3) RGB in 0..1 (figures only)."""
 
 APRON = 0.25  # width of the asphalt beyond the kerbs, m
 ARROW_EVERY = 24.0  # approximate distance between two direction arrows on a one-way lane, m
 
 _CORNER = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+# Outline of a car of unit length and width, nose to +x.
 CAR_BODY = 0.5 * np.stack(
     [np.sign(f) * np.abs(f) ** 0.36 for f in (np.cos(_CORNER), np.sin(_CORNER))], axis=1
 )
-"""Outline of a car of unit length and width, nose to +x."""
 WINDSCREEN = np.array([[0.24, -0.40], [0.24, 0.40], [0.10, 0.32], [0.10, -0.32]])
 REAR_WINDOW = np.array([[-0.36, -0.36], [-0.36, 0.36], [-0.26, 0.30], [-0.26, -0.30]])
 DISC = 0.5 * np.stack([np.cos(_CORNER), np.sin(_CORNER)], axis=1)

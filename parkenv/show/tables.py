@@ -79,6 +79,7 @@ class Column(NamedTuple):
     needs: str = ""
 
 
+# Columns of searches, in the order of tables.
 SHARED = (
     Column("scenario", "scenario", setting=True),
     Column("blind", "blind", help="Whether no slot is observed before an attempt", setting=True),
@@ -112,7 +113,6 @@ SHARED = (
     Column("decision_ms", "a decision takes", "ms", 2, help="Median wall time of a decision"),
     Column("decision_ms_p99", "99 % of decisions below", "ms", 2, help="99th percentile of their wall times"),
 )  # fmt: skip
-"""Columns of searches, in the order of tables."""
 
 
 def shared(*keys: str) -> tuple[Column, ...]:

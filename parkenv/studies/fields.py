@@ -114,12 +114,12 @@ def _tables(value: object) -> object:
     return parse_call(value) if isinstance(value, str) else value
 
 
+# An agent in a file: `"mdp"`, `"mdp(failure_s=90)"` or a table.
 AgentItem = Annotated[AgentSpec, BeforeValidator(_tables), OrText()]
-"""An agent in a file: `"mdp"`, `"mdp(failure_s=90)"` or a table."""
 
 
+# Maximum number of episodes of an experiment, over all agents, scenarios and settings.
 MAX_EPISODES = 10_000_000
-"""Maximum number of episodes of an experiment, over all agents, scenarios and settings."""
 T = TypeVar("T")
 
 
@@ -130,8 +130,8 @@ def _scenario_tables(value: object, info: ValidationInfo) -> object:
     return scenario_spec(value if str(value) in SCENARIO_NAMES else Path(folder) / value)
 
 
+# A scenario in a file: a name, a file, or an inline table.
 ScenarioItem = Annotated[ScenarioSpec, BeforeValidator(_scenario_tables), OrText()]
-"""A scenario in a file: a name, a file, or an inline table."""
 
 
 def _with_folders(value: object, info: ValidationInfo) -> object:
@@ -196,10 +196,10 @@ _LOT_ALONE = (
 )
 
 
+# Options of what parking costs, which only matters where slots are chosen.
 PRICES = ("--price", "--value-of-time", "--stay-min")
-"""Options of what parking costs, which only matters where slots are chosen."""
+# Options of other road users, whom only simulated sensors and driven cars meet.
 TRAFFIC = ("--cars", "--pedestrians")
-"""Options of other road users, whom only simulated sensors and driven cars meet."""
 _NAMES = ", ".join(SCENARIO_NAMES)
 SCENARIOS_HELP = f"{_NAMES}; scenario files (.toml), lots (.geojson), or folders."
 ScenarioList = Annotated[

@@ -109,8 +109,8 @@ class Table:
             write_csv(folder / file, names, lists)
 
 
+# Searches of comparisons.
 EPISODES = Table("episodes.csv", KEY_COLUMNS, OUTCOME_COLUMNS, lists=("timings.csv", (DECISIONS,)))
-"""Searches of comparisons."""
 
 
 def _store(folder: Path, *, create: bool) -> RowFile:

@@ -254,8 +254,8 @@ def _run_stage(
                 warnings.warn(f"{topic[0]}: {message}", stacklevel=2)
 
 
+# The study of a worker process, by its token: it keeps its scenarios for the next block.
 _KEPT: dict[str, Study] = {}
-"""The study of a worker process, by its token: it keeps its scenarios for the next block."""
 
 
 def _run_block(token: str, study: Study, work: Any, items: Sequence[Any]) -> tuple[list[Row], list[str]]:

@@ -14,8 +14,8 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent, ClairvoyantAgent
 
+# Step limit of environments that are not made by `gymnasium.make`, the same as that of `parkenv/Search-v2`.
 STEP_LIMIT = 2000
-"""Step limit of environments that are not made by `gymnasium.make`, the same as that of `parkenv/Search-v2`."""
 
 
 class Step(NamedTuple):

@@ -12,8 +12,8 @@ from scipy.special import stdtrit
 from parkenv.world.cost_terms import COST_FIELDS
 
 RESAMPLES = 9999
+# Fewest paired searches that can show a difference at 95 %: with five, all of one sign come up once in 16.
 LEAST_PAIRS = 6
-"""Fewest paired searches that can show a difference at 95 %: with five, all of one sign come up once in 16."""
 _ROUNDING = 1e-12  # relative difference of values that count as the same
 
 

@@ -52,8 +52,8 @@ STUDIES: Mapping[str, str] = {
 }
 
 
+# Called with what is going on, how much of it is finished, and of how much; 0 where that is not known yet.
 Progress = Callable[[str, int, int], None]
-"""Called with what is going on, how much of it is finished, and of how much; 0 where that is not known yet."""
 
 
 def run_tasks(doing: str, tasks: Sequence[Task[object]], workers: Workers, progress: Progress) -> None:
@@ -114,8 +114,8 @@ class Cell(NamedTuple):
 
 MOST_SLOTS = 20_000  # lots with more slots are not replayed: the page would not load
 AGREES_S = 1e-6  # total times of a search or a day that differ by less agree, s
+# Searches in a world, a drive or a day in the data of a page; its `differences` from the run are notes.
 Recording = dict[str, Any]
-"""Searches in a world, a drive or a day in the data of a page; its `differences` from the run are notes."""
 
 
 class ReplayJob(NamedTuple):

@@ -29,10 +29,8 @@ from parkenv.errors import InputError, require_one_of, with_extra
 from parkenv.files.known_names import BackendName
 
 BACKENDS = get_args(BackendName)
-CONNECT_S = 5.0
-"""Time for a cluster to answer at its address, s."""
-LOSSES = 3
-"""Maximum number of workers that may die in a row without finishing a task."""
+CONNECT_S = 5.0  # time for a cluster to answer at its address, s
+LOSSES = 3  # maximum number of workers that may die in a row without finishing a task
 
 Result = TypeVar("Result")
 Task = Callable[[], Result]
@@ -229,8 +227,7 @@ def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Generator[tuple
         future.release()
 
 
-SERIAL = Workers(1)
-"""Runs everything in this process."""
+SERIAL = Workers(1)  # runs everything in this process
 
 
 def worker_start() -> dict[str, Any]:

@@ -35,13 +35,13 @@ from parkenv.world.scenario import SearchProblem
 from planners.bounds.oracle import best_slot
 from planners.routes import DriveRoutes
 
+# Slots in groups, those with the least drive and walk. To park elsewhere costs at least as much as the next one.
 MOST_SLOTS = 240
-"""Slots in groups, those with the least drive and walk. To park elsewhere costs at least as much as the next one."""
+# Most pairs of a set of seen groups and the vertex where the last came into view: so fine are the groups.
 MOST_STATES = 4_000
-"""Most pairs of a set of seen groups and the vertex where the last came into view: so fine are the groups."""
 FINE_S = 25.0  # s by which a slot must be worse than the best one for a group to be e times as wide there
+# Ends of the periods of waiting that `value` tells apart, in units of what a search takes if nothing is found.
 PERIODS = np.array([0.1, 0.25, 0.5, 1.0, 2.0, 4.0])
-"""Ends of the periods of waiting that `value` tells apart, in units of what a search takes if nothing is found."""
 _MOST_GROUPS = 62  # bits of a set
 _FAR_S = 3600.0
 _SURE = 1e-12

@@ -21,21 +21,21 @@ from planners.driving.clearance import Clearance, clearance, free_length, room_a
 from planners.driving.hybrid_astar import WINDOW_M, SearchSettings, plan_path
 from planners.driving.path_tracking import PathTracker, TrackingSettings
 
+# Settings of the search in scenes: long moves first, and a path soon rather than the shortest.
 SEARCH = SearchSettings(
     greed=2.0, patience=0.3, most_expansions=8_000, attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.04, 0.5))
 )
-"""Settings of the search in scenes: long moves first, and a path soon rather than the shortest."""
+# Settings of the search out of the tightest slots.
 TIGHT = dataclasses.replace(SEARCH, most_expansions=6_000, attempts=((0.04, 0.0), (0.02, 0.0), (0.01, 0.0)))
-"""Settings of the search out of the tightest slots."""
+# Settings of the last search, out of slots hardly longer than the car.
 FINEST = dataclasses.replace(SEARCH, most_expansions=12_000, attempts=((0.008, 0.0), (0.004, 0.0)))
-"""Settings of the last search, out of slots hardly longer than the car."""
 WIDE_M = 25.0  # margin, m, around start and target of the search for ways around
+# Settings of the tracking where a fluent drive would touch something.
 EXACT = TrackingSettings(
     speed=0.8, reverse_speed=0.8, acceleration=0.6, firmness=2.5, control_s=PHYSICS_S, stops=True
 )
-"""Settings of the tracking where a fluent drive would touch something."""
+# Largest distance, m, and angle, rad, of the pose aimed at from the target, within what a scene tolerates.
 AIM_M, AIM_RAD = 0.03, 0.004
-"""Largest distance, m, and angle, rad, of the pose aimed at from the target, within what a scene tolerates."""
 _ROOMY_M = 0.1  # room at the target, m, from which on the car aims at it exactly
 # Clearance, m, and share of the tolerance, from which on a fluent drive is enough.
 _CLOSE_M, _SURE = 0.015, 0.8

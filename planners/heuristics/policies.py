@@ -94,6 +94,7 @@ def decide_random(address: int, number: int) -> int:
     return int(max(draw_action(search_of(car_of(address, number).search), _N_ACTIONS), 0))
 
 
+# The compiled policies of the heuristics without options, by name.
 POLICIES = {
     policy.name: policy
     for policy in (
@@ -105,4 +106,3 @@ POLICIES = {
         CompiledPolicy("random", decide_random),
     )
 }
-"""The compiled policies of the heuristics without options, by name."""

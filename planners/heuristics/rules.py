@@ -44,8 +44,8 @@ UNOBSERVED_DETOUR = 3.0
 Where one slot in two is free, the drive to a slot with arrival cost c pays off against one that is known to be free,
 and takes t in all, if drive + c / 2 + (drive + t) / 2 < t, since it may have to drive back: if c + 3 drive < t.
 """
+# What `_nearest` ranks slots by: the drive; then the arrival cost; the sum of both.
 BY_DRIVE, BY_DRIVE_THEN_COST, BY_TOTAL = range(3)
-"""What `_nearest` ranks slots by: the drive; then the arrival cost; the sum of both."""
 _N_MOVES = len(MOVES)
 _ROUNDING_S = 1e-6
 
@@ -58,6 +58,7 @@ def addresses(names: str) -> list[tuple[str, Any]]:
     return [(name, ADDRESS) for name in names.split()]
 
 
+# What a heuristic needs in a lot, and its work space.
 TABLES = np.dtype(
     [
         ("heuristic", np.int64),
@@ -81,7 +82,6 @@ TABLES = np.dtype(
     ],
     align=True,
 )
-"""What a heuristic needs in a lot, and its work space."""
 tables_at = record_at(TABLES)
 
 

@@ -52,11 +52,12 @@ from planners.heuristics.rules import (
     state_of,
 )
 
+# Free slots, seen and expected, that stand for what a driver believes of a zone before it has seen any of it.
 PRIOR_PSEUDO_COUNT = 1.0
-"""Free slots, seen and expected, that stand for what a driver believes of a zone before it has seen any of it."""
 _N_MOVES = len(MOVES)
 _NONE = -1
 
+# The streets of a lot, and work space.
 STREETS = np.dtype(
     [
         # TABLES of `greedy-drive`, for where no place is left.
@@ -101,7 +102,6 @@ STREETS = np.dtype(
     ],
     align=True,
 )
-"""The streets of a lot, and work space."""
 streets_at = record_at(STREETS)
 
 

@@ -28,11 +28,11 @@ from planners.network.features import (
 from planners.network.lookahead import Decision, Scratch
 from planners.network.policy import SHIPPED, NetworkPolicy
 
+# Penalty of an action, in time scales, for each visit of its end since something new was observed.
 CIRCLING = 0.1
-"""Penalty of an action, in time scales, for each visit of its end since something new was observed."""
 
+# Expected number of free slots among those that were not observed, below which `belief` drives.
 HARDLY_ANY = 0.1
-"""Expected number of free slots among those that were not observed, below which `belief` drives."""
 
 
 @dataclass

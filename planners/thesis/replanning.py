@@ -28,8 +28,8 @@ from planners.thesis.label_setting import (
 from planners.thesis.mdp import ParkingMDP
 
 RELEVANT_CHANGE = 0.01  # replan once a probability differs by more than this from that of the plan
+# How plans are made: exactly in near-linear time, or as in the thesis. They lead to the same actions.
 SOLVERS = ("label_setting", "policy_iteration")
-"""How plans are made: exactly in near-linear time, or as in the thesis. They lead to the same actions."""
 MOST_HOPS = 400  # maximum number of vertices of a plan preview
 
 
@@ -185,8 +185,8 @@ class ReplanningAgent(StaticAgent):
         return super().decide(observation, belief, memory)
 
 
+# Slots compared at a time: a plain loop that finds most blocks unchanged is bound by memory alone.
 _BLOCK = 1024
-"""Slots compared at a time: a plain loop that finds most blocks unchanged is bound by memory alone."""
 
 
 @compiled

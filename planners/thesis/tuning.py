@@ -30,8 +30,8 @@ from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
 from planners.thesis.replanning import Plan, ReplanningAgent
 
+# s, failure costs to choose from; each is twice the previous one.
 COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-"""s, failure costs to choose from; each is twice the previous one."""
 WORLDS = 128
 _MOST_STEPS = 2000
 _KEPT = 256

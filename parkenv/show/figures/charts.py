@@ -20,8 +20,8 @@ from parkenv.show.figures.picture_files import STYLE
 Row = Mapping[str, Any]
 Style = Mapping[str, Any]  # arguments of Matplotlib's artists
 Mark = Callable[[Axes], object]  # something that draws itself on axes
+# Colours of series, distinguishable with any colour vision.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Colours of series, distinguishable with any colour vision."""
 GREY = "#999999"
 BOLD: Style = {"weight": "bold"}
 PERCENT = PercentFormatter(1.0)

@@ -43,19 +43,19 @@ from parkenv.world.tariff import NO_ZONE
 INK = "#333333"
 GROUND, ENTRY, GOAL = (hex_color(name) for name in ("ground", "entry", "goal"))
 ARROWHEAD_LENGTH = 0.9  # m, of a move in the drive graph
+# An arrow from the entry into the lot.
 ENTRY_ARROW = np.array(
     [[1.0, 0.0], [0.6, 0.28], [0.6, 0.1], [0.0, 0.1], [0.0, -0.1], [0.6, -0.1], [0.6, -0.28]]
 )
-"""An arrow from the entry into the lot."""
+# Colours of beliefs, from free to taken.
 BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
-"""Colours of beliefs, from free to taken."""
+# Colours of zones; the first seven are distinguishable with any colour vision.
 ZONE_COLORS = (
     *("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442"),
     *("#882255", "#117733", "#332288", "#aa4499", "#999933", "#44aa99", "#661100"),
 )
-"""Colours of zones; the first seven are distinguishable with any colour vision."""
+# Ground of a parking sign, which marks counted facilities with their capacity.
 PARKING_SIGN = "#1565c0"
-"""Ground of a parking sign, which marks counted facilities with their capacity."""
 MOST_SIGNS = 40  # counted facilities with signs; more are discs
 INK_PALE = "#b4b8bd"
 COST_MAP = "viridis"  # colour map of parking costs

@@ -49,14 +49,14 @@ _TRIANGLE = np.array([[0.5, 0.0], [-0.5, 0.5], [-0.5, -0.5]])
 SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677")
 AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
 SLOT = "#9db8d2"
+# Colour of a slot by what its capacity is known from.
 KERB_COLORS = {"tag": "#225588", "register": "#225588", "drawn": "#4477aa", "rule": "#8fb8d8"}
-"""Colour of a slot by what its capacity is known from."""
 COUNTED_COLORS = {"lot": "#228833", "garage": "#aa3377", "kerb": "#4477aa"}
 STREET = "#8a8a84"
 SPACE_M2 = 60.0  # m² of a counted facility's disc for each place: twice the room of a parked car
 COLUMNS = 6
+# Width and height of a lot with its caption in a contact sheet, and the height of the key, inches.
 WIDTH, HEIGHT, KEY = 2.8, 3.2, 0.4
-"""Width and height of a lot with its caption in a contact sheet, and the height of the key, inches."""
 SCALES = (5, 10, 20, 50, 100, 200, 500)  # lengths of the scale bar, m
 LONGEST_NAME = 28
 LARGEST = 60  # number of lots in one sheet

@@ -21,16 +21,16 @@ from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, painted_finely, strip, w
 from parkenv.show.painters.opencv import MapView, paint
 from parkenv.show.scene import FREE, Areas, Layer, Lines, mixed_color
 
+# Frames per second of a film, how much faster than real it is, and its colours.
 FPS, SPEED_UP, COLORS = 10, 4, 64
-"""Frames per second of a film, how much faster than real it is, and its colours."""
 _SIZE = (WIDTH, HEIGHT - HUD)
 _MARGIN = 2.5  # m, around what is driven
 _LINE = 0.16  # m, obstacles that are lines
 GAP = 6  # between pictures of a sheet, px
 _STILL = 5  # times that a film shows its last frame
 
+# A scene, its lines of `trajectories.csv`, and what is said of it.
 Shown = tuple[Scene, Mapping[str, Any], str]
-"""A scene, its lines of `trajectories.csv`, and what is said of it."""
 
 
 def save_sheet(pictures: Sequence[Image], path: Path) -> None:

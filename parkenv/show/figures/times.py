@@ -36,6 +36,7 @@ from parkenv.show.figures.picture_files import INK, STYLE, picture, save_picture
 from parkenv.show.tables import LEAST_SEARCHES, SETTING_AXES, plural
 from parkenv.world.cost_terms import COST_TERMS
 
+# Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol).
 AGENT_COLORS = {
     "mdp": "#0072b2",
     "mdp-static": "#56b4e9",
@@ -57,7 +58,6 @@ AGENT_COLORS = {
     "ppo": "#332288",
     "maskable-ppo": "#aa4499",
 }
-"""Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol)."""
 _OTHERS = ("#5c4a3d", "#a6761d", "#6a3d9a", "#1b7a8c", "#b15928")
 OFF_SCALE = 3.0  # totals above this multiple of the median are cut off, so that they do not compress the rest
 BOUND = "clairvoyant lower bound"
@@ -305,8 +305,8 @@ def _each(searches: Sequence[int]) -> str:
     return f" ({plural(searches[0], 'search', 'searches')})" if len(set(searches)) == 1 else ""
 
 
+# Column `map` of the references: a right map that does not learn; an agent that uses no map.
 FIXED, NONE = "fixed", "none"
-"""Column `map` of the references: a right map that does not learn; an agent that uses no map."""
 _WORDS = {"empty": "empty map at first", "right": "right map at first", "wrong": "wrong map at first"}
 _DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))  # lines of an agent with different options
 _FIXED_LINE: dict[str, Any] = {"linewidth": 1.2, "linestyle": (0, (1, 1))}
@@ -411,8 +411,8 @@ def _dashes(rows: Sequence[Row]) -> dict[str, Any]:
     return {agent: _DASHES[alike[color].index(agent) % len(_DASHES)] for agent, color in colors.items()}
 
 
+# Colours of trainings: as many as are easy to tell apart.
 TRAINING_COLORS = (*COLORS, "#555555")
-"""Colours of trainings: as many as are easy to tell apart."""
 OFF_CURVES = 2.0  # times above this multiple of the lowest are cut off
 _NAMES_APART = 0.045  # least distance of two labels, fraction of the axis
 _MARGIN_IN = 0.12  # beside the labels, inches

@@ -46,8 +46,8 @@ WIDTH, HEIGHT = 640, 480
 HUD = 34  # height, px, of the line of text below the map
 HUD_MARGIN = 14
 MARGIN = 8.0  # margin, px, around the lot
+# Slot width, px, below which a frame shows a window around the car instead of the whole lot.
 SMALLEST_SLOT = 4.0
-"""Slot width, px, below which a frame shows a window around the car instead of the whole lot."""
 WINDOW_SLOT = 9.0  # width, px, of a slot in such a window
 LARGEST_SCALE = 22.0  # largest scale, px/m, so that a small lot does not fill the frame
 PIXELS = MapView(np.eye(2), 1.0, np.zeros(2))  # for layers in pixels

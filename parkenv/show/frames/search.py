@@ -31,10 +31,10 @@ from parkenv.world.scenario import Scenario
 _LIKELY = 0.25  # P(about to leave) from which a car is marked
 _KEY_WIDTH = 158  # width, px, of the colour key at the right of the line of text
 
+# Rows of the text map: with the lines above and below, it fits an 80 × 24 terminal.
 TEXT_WIDTH, TEXT_ROWS = 78, 17
-"""Rows of the text map: with the lines above and below, it fits an 80 × 24 terminal."""
+# Smallest and largest width, m, of a cell; larger lots show a window around the car, so slots stay apart.
 TEXT_CELL_LEAST, TEXT_CELL = 1.25, 3.5
-"""Smallest and largest width, m, of a cell; larger lots show a window around the car, so slots stay apart."""
 
 
 class SearchRenderer:

@@ -151,10 +151,10 @@ def _grid_png(grid: OccupancyGrid) -> str:
 
 
 _COLORS = np.linspace([150.0, 190.0, 215.0], [112.0, 48.0, 170.0], LEVELS)
+# Transparent, then from pale blue to dark violet.
 _PALETTE = [0, 0, 0, *np.round(_COLORS).astype(int).ravel().tolist()]
-"""Transparent, then from pale blue to dark violet."""
+# Opacity of each colour: slots are visible through free cells.
 _OPACITY = bytes([0, *np.round(np.linspace(50, 235, LEVELS)).astype(int).tolist()])
-"""Opacity of each colour: slots are visible through free cells."""
 
 
 def data_uri(kind: str, content: bytes) -> str:

@@ -23,25 +23,25 @@ from parkenv.world.cost_terms import COST_TERMS
 Row = Mapping[str, Any]
 
 FORMAT, VERSION = "parkenv-report", 1  # JSON schema of the data in a page
+# Scripts of the page, in order of dependence.
 SCRIPTS = (
     "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_track.js",
     "search_replay.js", "drive_replay.js", "fleet_replay.js", "town_map.js", "page.js",
 )  # fmt: skip
-"""Scripts of the page, in order of dependence."""
+# Scripts of a game's page.
 GAME_SCRIPTS = ("numbers.js", "lot_view.js", "player.js", "search_track.js", "game_search.js", "game.js")
-"""Scripts of a game's page."""
 MOST_WIDTH = 1800  # px; wider figures are scaled down
 LOSSLESS = 150_000  # bytes above which a figure is compressed lossily
 _QUALITY = 86
 _HERE = Path(__file__).parent
+# The first figures of a page: prefixes of their file names.
 _ORDER = (
     "time_split", "time_distribution", "time_against_occupancy", "time_against_failure_cost", "time_against_map",
     "searches", "session", "detections", "slots_found", "reach", "graph", "map", "learning_curve",
 )  # fmt: skip
-"""The first figures of a page: prefixes of their file names."""
 _WIDE = 2.2  # least ratio of width to height of a figure that has the page to itself, such as charts in a row
+# Least white share of a chart, which is inverted in dark mode; pictures of lots and photographs are not.
 _WHITE = 0.5
-"""Least white share of a chart, which is inverted in dark mode; pictures of lots and photographs are not."""
 
 
 class Page(NamedTuple):

@@ -51,12 +51,12 @@ DEFAULT_AGENTS = (
     "mdp", "belief", "mdp-tuned", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
 )  # fmt: skip
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)  # occupancy levels of the command
+# Failure costs of `--failure-cost sweep`, s.
 FAILURE_COST_SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
-"""Failure costs of `--failure-cost sweep`, s."""
+# Agents that require observations of slots before an attempt.
 NEEDS_OBSERVATIONS = ("belief", "belief-rivals", "mdp-tuned", "exact", "network")
-"""Agents that require observations of slots before an attempt."""
+# Separator between the name of a scenario and the constant probability of its forecast.
 CONSTANT_FORECAST = "-constant-forecast-"
-"""Separator between the name of a scenario and the constant probability of its forecast."""
 
 
 def _failure_costs(text: str) -> object:

@@ -23,16 +23,15 @@ from parkenv.studies.compare.cases import Case, against_occupancy
 from parkenv.world.scenario import KMH
 
 Row = Mapping[str, Any]
-Setting = tuple[float, ...]
-"""Failure cost, s, walking and driving speed, km/h."""
+Setting = tuple[float, ...]  # failure cost, s, walking and driving speed, km/h
+# What figures show: a scenario, or "" for several; a setting, or () for several; and the figure.
 Drawn = Iterator[tuple[str, Setting, Figure]]
-"""What figures show: a scenario, or \"\" for several; a setting, or () for several; and the figure."""
 
+# Agents whose paths are drawn beside those of the first and of the fastest agent, the most interesting first.
 PICTURED = ("belief", "oracle", "first-free", "greedy-goal")
-"""Agents whose paths are drawn beside those of the first and of the fastest agent, the most interesting first."""
 MOST_PICTURED = 4
+# Bin edges for averaging episodes if the run has no occupancy levels.
 OCCUPANCY_BINS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
-"""Bin edges for averaging episodes if the run has no occupancy levels."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +145,7 @@ def _searches(results: ComparisonResults) -> Drawn:
         yield *where, draw_searches(records)
 
 
+# Caption of all figures of each kind and what draws them, by the prefix of their files, in the order of reports.
 FIGURES: Mapping[str, tuple[str, Callable[[ComparisonResults], Drawn]]] = {
     "time_split": ("Where the time goes", _time_splits),
     "time_distribution": ("How many searches took at most how long", _time_distributions),
@@ -154,7 +154,6 @@ FIGURES: Mapping[str, tuple[str, Callable[[ComparisonResults], Drawn]]] = {
     "time_against_map": ("If the forecast is the same for every slot", _times_against_map),
     "searches": ("Searches on the same day", _searches),
 }
-"""Caption of all figures of each kind and what draws them, by the prefix of their files, in the order of reports."""
 
 
 def draw_figures(

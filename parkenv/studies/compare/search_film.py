@@ -25,8 +25,8 @@ FPS = 10.0
 DRIVE_SPEEDUP, WALK_SPEEDUP = 3.0, 12.0  # playback speed relative to real time
 MOST_FRAMES = 360  # maximum number of frames; longer searches are played faster
 COLORS = 192  # number of colours of a film: enough for drawings and the camera's image
+# Width of a frame, and heights of the caption and of the panel below the map, px.
 WIDTH, CAPTION, PANEL = 840, 48, 172
-"""Width of a frame, and heights of the caption and of the panel below the map, px."""
 MAP_HEIGHT = (220, 420)  # least and greatest height of the map, px
 PAPER = (248, 248, 245)
 SOFT = (96, 104, 112)

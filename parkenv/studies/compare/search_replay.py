@@ -18,11 +18,11 @@ from parkenv.studies.study import AGREES_S, MOST_SLOTS, Recording, ReplayJob, Re
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.occupancy.process import World
 
+# Time, s, up to which the true occupancy is recorded every second; later it is recorded only at decisions.
 STEADY_S = 600.0
-"""Time, s, up to which the true occupancy is recorded every second; later it is recorded only at decisions."""
 FULL = 255  # recorded value of a belief of 1
+# Default number of replayed searches: in general, and with rendered sensors at every step.
 SEARCHES, SENSED = 20, 4
-"""Default number of replayed searches: in general, and with rendered sensors at every step."""
 
 
 class Encounter(NamedTuple):

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 AGENTS = ("mdp", "belief", "first-free", "greedy-drive", "oracle")
 FILMED = "belief"
 FILM, LOT = "search.gif", "lot.png"
+# What is added to the name of the scenario in searches with the error rates of the sensors.
 WITHOUT_IMAGES = " without images"
-"""What is added to the name of the scenario in searches with the error rates of the sensors."""
 FIGURES = ("time_split", "time_distribution")  # names of figures of comparisons
 QUICK = {"sessions": 2, "episodes": 2, "more": 100, "every": 4.0}  # settings of a shorter demo
 RIG: RigName = "laser"

@@ -27,11 +27,11 @@ from sim_sensors.ground_truth import View
 
 Film = Video | Footage
 
+# Columns of `boxes.csv`; frame (from 0) and time_s are empty for images, visible_fraction where the detector does not
+# know it.
 BOX_COLUMNS = (
     "file", "frame", "time_s", "left", "top", "right", "bottom", "probability", "view", "visible_fraction",
 )  # fmt: skip
-"""Columns of `boxes.csv`; frame (from 0) and time_s are empty for images, visible_fraction where the detector does not
-know it."""
 
 
 class FoundCars(NamedTuple):

@@ -31,12 +31,12 @@ from sim_sensors.camera.weather import Weather
 from sim_sensors.ground_truth import vehicle_boxes
 from sim_sensors.rig import SensorRig, poses_along
 
+# Ends of the bands of distance from the car to a slot's vertex, m; the first band is the slot at the car's vertex.
 BAND_ENDS = (0.5, 3.5, 6.5, 9.5, 12.5, 16.0)
-"""Ends of the bands of distance from the car to a slot's vertex, m; the first band is the slot at the car's vertex."""
+# Agents whose searches are counted, so that the observations are those of typical searches.
 AGENTS = ("greedy-drive", "mdp", "first-free")
-"""Agents whose searches are counted, so that the observations are those of typical searches."""
+# Least number of observations in a band for rates of its own; otherwise those of all bands are used.
 LEAST_OBSERVATIONS = 20
-"""Least number of observations in a band for rates of its own; otherwise those of all bands are used."""
 _NONE = np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64)
 _ASSUMED = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 PICTURES = 4  # number of perception results of the first session that are kept for figures
 DRIVEN = "driven"  # key of what a session found in its row; the map keeps it
+# Key of the first session in `Results.kept`: its result, with perception results for figures, and its recording.
 SHOWN = "shown"
-"""Key of the first session in `Results.kept`: its result, with perception results for figures, and its recording."""
 
 
 _METHODS = (

@@ -57,12 +57,12 @@ from planners.model_file import LearnedAgent, algorithm_class, save_model, slots
 if TYPE_CHECKING:
     from parkenv.studies.training.spec import TrainingSpec
 
+# First world seeds of the evaluations during training, of the final test, and of the demonstrations.
 EVALUATION_SEED, TEST_SEED, DEMONSTRATION_SEED = 2_000_000, 3_000_000, 5_000_000
-"""First world seeds of the evaluations during training, of the final test, and of the demonstrations."""
+# World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites.
 TRAINING_SEEDS = 10_000_000
-"""World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites."""
+# Number of evaluations, and decisions between two at most, if the specification does not say.
 EVALUATIONS, MOST_BETWEEN = 10, 100_000
-"""Number of evaluations, and decisions between two at most, if the specification does not say."""
 MODEL, FIGURE, CHECKPOINT = "model.safetensors", "learning_curve.png", "checkpoint.pt"
 METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
 HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
@@ -72,16 +72,16 @@ PLANNERS = tuple(
     AgentSpec(name=name)
     for name in ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
 )
+# The same with held-out places: those that need no time on each lot.
 PLANNERS_OF_PLACES = tuple(spec for spec in PLANNERS if spec.name not in ("mdp-tuned", "greedy-goal"))
-"""The same with held-out places: those that need no time on each lot."""
+# Fields of a specification that do not change its trainings, that `settings` gives in other words, or that a resumed
+# training may change.
 _OUTSIDE = {
     "kind", "jobs", "backend", "address", "trainings", "seed", "steps", "agents", "tensorboard", "scenarios",
     "held_out", "evaluate_on", "test_on",
 }  # fmt: skip
-"""Fields of a specification that do not change its trainings, that `settings` gives in other words, or that a resumed
-training may change."""
+# Total time of each episode, s, and whether its car parked.
 Times = tuple[NDArray[np.float64], NDArray[np.bool_]]
-"""Total time of each episode, s, and whether its car parked."""
 
 
 class Training:

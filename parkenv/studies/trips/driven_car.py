@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
 ALONG, TURN, ROUND, ACROSS = "along", "turn", "round", "across"
+# Kinds of edges: straight on; with a turn into another lane; with a U-turn; across a two-way lane, where the car
+# turns round only if it drives on afterwards, not if it parks.
 EDGE_KINDS = (ALONG, TURN, ROUND, ACROSS)
-"""Kinds of edges: straight on; with a turn into another lane; with a U-turn; across a two-way lane, where the car turns
-round only if it drives on afterwards, not if it parks."""
 TAKEN, NO_ROOM, NO_WAY = "taken", "too narrow", "no way in"  # reasons of failed attempts
 
 
