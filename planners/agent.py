@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError, nearest, require
 from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import SearchProblem
@@ -151,8 +151,10 @@ def belief_for_decision(observation: Observation) -> SlotBelief:
 
 def require_observations(name: str, problem: SearchProblem) -> None:
     """Raise an `InputError` for the agent `name` if the problem's sensor can never observe a slot from the lane."""
-    if not problem.sensor_rates.seen.any():
-        raise InputError(f"{name} plans on observations, and this sensor model has none; take mdp")
+    require(
+        problem.sensor_rates.seen.any(),
+        f"{name} plans on observations, and this sensor model has none; take mdp",
+    )
 
 
 def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
@@ -169,12 +171,10 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
     Raises:
         InputError: an unknown name or option; the message lists the known ones.
     """
-    if not isinstance(name, str):
-        raise InputError(f"agent is {name!r:.60}, want a name, such as 'mdp'")
+    require(isinstance(name, str), f"agent is {name!r:.60}, want a name, such as 'mdp'")
     before, colon, after = name.partition(":")
     if colon and before in (*ALGORITHMS, HUMAN):
-        if options:
-            raise InputError(f"agent {name!r} has no options; got {', '.join(options)}")
+        require(not options, f"agent {name!r} has no options; got {', '.join(options)}")
         if before == HUMAN:
             return _loaded("planners.human", "HumanAgent")(scenario, after)
         return _loaded("planners.model_file", "LearnedAgent")(scenario, before, after)
@@ -184,8 +184,7 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
     if colon:
         scenario = scenario.public()
     for option in options:
-        if option not in known:
-            raise InputError(f"agent {name!r} has no option {option!r}; {nearest(option, known)}")
+        require(option in known, f"agent {name!r} has no option {option!r}; {nearest(option, known)}")
     try:
         return agent(scenario, **options)
     except InputError:
@@ -217,11 +216,11 @@ def _class_of(name: str) -> Callable[..., Agent]:
         known = f"; nor is it an algorithm ({', '.join(FILE_AGENTS)})"
         own: Callable[..., Agent] = load_class(name, "agent", wanted, alternatives=known)
         return own
-    if name not in AGENTS:
-        raise InputError(
-            f"unknown agent {name!r}; {nearest(name, AGENTS)}, ALGORITHM:FILE for a trained model, MODULE:CLASS for "
-            "your own"
-        )
+    require(
+        name in AGENTS,
+        f"unknown agent {name!r}; {nearest(name, AGENTS)}, ALGORITHM:FILE for a trained model, MODULE:CLASS for "
+        "your own",
+    )
     return _loaded(*AGENTS[name])
 
 

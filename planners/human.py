@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.files.limited_reading import JsonFormat
 from parkenv.files.spec_file import Several, Spec
 from parkenv.world.scenario import SearchProblem
@@ -51,19 +51,23 @@ class HumanAgent(SearchAgent[Iterator[int]]):
         self.name = f"human:{path}"  # type: ignore[misc]
         scores = Scores.parse(_FORMAT.read(path), path)
         name = getattr(problem, "name", scores.scenario)
-        if scores.scenario != name:
-            raise InputError(f"{path}: scenario is {scores.scenario!r:.60}, want {name!r}, which is searched")
+        require(
+            scores.scenario == name,
+            f"{path}: scenario is {scores.scenario!r:.60}, want {name!r}, which is searched",
+        )
         self.totals = {one.seed: one.total_s for one in scores.worlds}
         self._actions = {(np.float32(one.arrival_s), one.entry): one.actions for one in scores.worlds}
-        if not len(self._actions) == len(self.totals) == len(scores.worlds):
-            raise InputError(f"{path}: worlds has a world twice, want each once")
+        require(
+            len(self._actions) == len(self.totals) == len(scores.worlds),
+            f"{path}: worlds has a world twice, want each once",
+        )
 
     def begin(self, observation: Observation, belief: SlotBelief) -> Iterator[int]:
         start = (np.float32(observation["time"][0]), int(observation["vertex"]))
-        if start not in self._actions:
-            raise InputError(
-                f"{self.name} has no search that begins at {start[0]:.2f} s at vertex {start[1]}"
-            )
+        require(
+            start in self._actions,
+            f"{self.name} has no search that begins at {start[0]:.2f} s at vertex {start[1]}",
+        )
         return map(int, self._actions[start])
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: Iterator[int]) -> int:

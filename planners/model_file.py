@@ -22,7 +22,7 @@ from pydantic import ConfigDict, Field, JsonValue, model_validator
 from pydantic_core import to_jsonable_python
 
 from parkenv.engine.local_observation import FIRST_NEAR, PER_NEAR, local_space
-from parkenv.errors import InputError, with_extra
+from parkenv.errors import InputError, require, with_extra
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import parse_json, read_bytes
 from parkenv.files.spec_file import Several, Spec
@@ -52,16 +52,16 @@ def read_header(
 ) -> tuple[dict[str, Any], dict[str, Any], memoryview]:
     """Return the card and the entries of the tensors, neither validated, and the bytes behind."""
     size = int.from_bytes(data[:8], "little")
-    if data[8:9] != b"{" or size > min(_MAX_HEADER, len(data) - 8):
-        raise InputError(f"{path}: no model file, or a damaged one")
+    require(
+        data[8:9] == b"{" and size <= min(_MAX_HEADER, len(data) - 8),
+        f"{path}: no model file, or a damaged one",
+    )
     header = parse_json(data[8 : 8 + size], f"{path}: header")
     metadata = header.pop("__metadata__", None)
-    text = metadata.get(CARD_KEY) if isinstance(metadata, dict) else None
-    if not isinstance(text, str):
-        raise InputError(f"{path}: no model of `parkenv train`: it has no card")
+    text: Any = metadata.get(CARD_KEY) if isinstance(metadata, dict) else None
+    require(isinstance(text, str), f"{path}: no model of `parkenv train`: it has no card")
     card = parse_json(text, f"{path}: card")
-    if not isinstance(card, dict):
-        raise InputError(f"{path}: card is a {type(card).__name__}, want a JSON object")
+    require(isinstance(card, dict), f"{path}: card is a {type(card).__name__}, want a JSON object")
     return card, header, memoryview(data)[8 + size :]
 
 
@@ -131,11 +131,11 @@ class ModelCard(_WithNulls):
 
     @classmethod
     def _of_bytes(cls, data: bytes, path: str | os.PathLike[str]) -> Self:
-        if data.startswith(_ZIP):
-            raise InputError(
-                f"{path}: is an archive of pickled objects, which run code when they are loaded; if you trust its "
-                f"author, load it with stable-baselines3 and write it by planners.model_file.save_model"
-            )
+        require(
+            not data.startswith(_ZIP),
+            f"{path}: is an archive of pickled objects, which run code when they are loaded; if you trust its "
+            f"author, load it with stable-baselines3 and write it by planners.model_file.save_model",
+        )
         return cls.parse(read_header(data, path)[0], f"{path}: card")
 
     def build(self) -> Any:
@@ -149,8 +149,7 @@ class ModelCard(_WithNulls):
 
 
 def algorithm_class(name: str) -> Any:
-    if name not in ALGORITHMS:
-        raise InputError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
+    require(name in ALGORITHMS, f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
     module, class_name = ALGORITHMS[name]
     with with_extra(name, "rl"):
         return getattr(import_module(module), class_name)
@@ -186,8 +185,7 @@ def save_model(
 
     name = type(model).__name__
     algorithm = next((key for key, (_, class_name) in ALGORITHMS.items() if class_name == name), None)
-    if algorithm is None:
-        raise InputError(f"the model is a {name}, want one of {', '.join(ALGORITHMS)}")
+    require(algorithm is not None, f"the model is a {name}, want one of {', '.join(ALGORITHMS)}")
     aliases = {kind: alias for alias, kind in type(model).policy_aliases.items()}
     options = {
         key: value.__name__ if isinstance(value, type) else value
@@ -216,8 +214,7 @@ def slots_observed(space: spaces.Space[Any]) -> int:
     """Return k of a model's observation space."""
     shape = space["local"].shape if isinstance(space, spaces.Dict) and "local" in space.spaces else None
     k = (shape[0] - FIRST_NEAR) // PER_NEAR if shape else 0
-    if k < 1 or space != local_space(k):
-        raise InputError("the model does not observe `local`")
+    require(k >= 1 and space == local_space(k), "the model does not observe `local`")
     return k
 
 
@@ -225,17 +222,18 @@ def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard,
     """Load card, policy and normalization of a model trained with an algorithm; no code from the file is run."""
     data = read_bytes(Path(path), _MAX_BYTES)
     card = ModelCard._of_bytes(data, path)
-    if card.algorithm != algorithm:
-        raise InputError(f"{path}: is a model of {card.algorithm}, not of {algorithm}")
-    if card.observation != OBSERVATION:
-        raise InputError(
-            f"{path}: observes {card.observation!r}, parkenv {card.parkenv}'s; want {OBSERVATION!r}"
-        )
+    require(card.algorithm == algorithm, f"{path}: is a model of {card.algorithm}, not of {algorithm}")
+    require(
+        card.observation == OBSERVATION,
+        f"{path}: observes {card.observation!r}, parkenv {card.parkenv}'s; want {OBSERVATION!r}",
+    )
     try:
         policy = card.build()
         weights = import_module("safetensors.torch").load(data)
-        if not all(bool((w.abs() <= _MAX_WEIGHT).all()) for w in weights.values()):
-            raise InputError(f"{path}: has weights that are no numbers, or above {_MAX_WEIGHT:g}")
+        require(
+            all(bool((w.abs() <= _MAX_WEIGHT).all()) for w in weights.values()),
+            f"{path}: has weights that are no numbers, or above {_MAX_WEIGHT:g}",
+        )
         normalization = Normalization.take_from(weights, policy.observation_space)
         policy.load_state_dict(weights)
     except InputError:
@@ -279,8 +277,10 @@ class Normalization:
                     f"the model's environment is wrapped in {name}, which a model file cannot hold"
                 )
             env = env.venv
-        if env is not None and any(any(env.env_is_wrapped(kind)) for kind in _TRANSFORMING):
-            raise InputError("the model's environment has a wrapper of observations or actions, want none")
+        require(
+            env is None or not any(any(env.env_is_wrapped(kind)) for kind in _TRANSFORMING),
+            "the model's environment has a wrapper of observations or actions, want none",
+        )
         return cls(tensors)
 
     @staticmethod
@@ -343,16 +343,16 @@ class LearnedAgent:
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
         """Choose an action for an observation of `LocalObservation`, as stable-baselines3 does."""
-        if "local" not in observation:
-            raise InputError(
-                f'{self.name} wants observations of an environment with observation="local", '
-                f"got {', '.join(observation)}"
-            )
+        require(
+            "local" in observation,
+            f'{self.name} wants observations of an environment with observation="local", '
+            f"got {', '.join(observation)}",
+        )
         given, wanted = observation["local"].shape[-1:], self.model.observation_space["local"].shape
-        if given != wanted:
-            raise InputError(
-                f"{self.name} observes {wanted[0]} numbers, got {given[0]} for its k = {self.card.k}"
-            )
+        require(
+            given == wanted,
+            f"{self.name} observes {wanted[0]} numbers, got {given[0]} for its k = {self.card.k}",
+        )
         # At a dead end there is no action, and whatever is chosen waits.
         mask = observation["action_mask"] | ~np.any(observation["action_mask"], axis=-1, keepdims=True)
         masks = {"action_masks": mask} if self.card.algorithm == "maskable-ppo" else {}

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError, nearest, require
 from parkenv.files.known_names import (
     DETECTOR_SUFFIXES,
     DETECTORS,
@@ -207,10 +207,10 @@ class _GroupPage(_Page, TyperGroup):
         raise typer.Exit(2)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args[0] not in self.commands and not ctx.resilient_parsing and args[0][:1] != "-":
-            raise InputError(
-                f"{ctx.command_path} has no command {args[0]!r}; {nearest(args[0], self.commands)}"
-            )
+        require(
+            args[0] in self.commands or ctx.resilient_parsing or args[0][:1] == "-",
+            f"{ctx.command_path} has no command {args[0]!r}; {nearest(args[0], self.commands)}",
+        )
         return super().resolve_command(ctx, args)
 
 

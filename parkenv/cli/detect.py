@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, print_rows, save_summary, stages
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import option
 from parkenv.files.spec_file import DetectorName, Several, require_together
@@ -128,10 +128,10 @@ class Detect(Command):
             return HogDetector.load(
                 *(self.model or ()), threshold=self.threshold, least_height=self.least_height
             )
-        if self.model or self.least_height is not None:
-            raise InputError(
-                f"--detector {self.detector} excludes --model and --least-height, which choose HOG models"
-            )
+        require(
+            not self.model and self.least_height is None,
+            f"--detector {self.detector} excludes --model and --least-height, which choose HOG models",
+        )
         return make_detector(self.detector, self.threshold)
 
 
@@ -198,8 +198,7 @@ class TrainDetector(Command):
         from parkenv.perception.hog_detector import END, SIDE
         from parkenv.perception.training import TrainingSettings, train
 
-        if self.out.suffix != ".npz":
-            raise InputError(f"--out {self.out}: want a name that ends in .npz")
+        require(self.out.suffix == ".npz", f"--out {self.out}: want a name that ends in .npz")
         check_writable(self.out)
         window = END if self.front else SIDE
         console = make_console()

@@ -12,7 +12,7 @@ from typer import echo
 from parkenv.cli.options import Command, Given, command_class, field_options, spec_of
 from parkenv.cli.report import Trust, make_report, require_trust
 from parkenv.cli.tables import command_line, make_console, print_table, stages
-from parkenv.errors import InputError, nearest, require
+from parkenv.errors import nearest, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Option, option
 from parkenv.studies.results import SPEC_FILE, without_nan
@@ -162,11 +162,11 @@ class Schema(Command):
     out: Path | None = option(None, "Folder for all schemas, KIND.schema.json.", short="-o", default="none")
 
     def run(self) -> None:
-        if self.kind is not None and self.kind not in KINDS:
-            raise InputError(f"KIND is {self.kind!r}; {nearest(self.kind, KINDS)}")
+        kind = "scenario" if self.kind is None else self.kind
+        require(kind in KINDS, f"KIND is {kind!r}; {nearest(kind, KINDS)}")
         texts = {kind: json.dumps(content, indent=1) for kind, content in schemas().items()}
         if self.out is None:
-            echo(texts[self.kind or "scenario"])
+            echo(texts[kind])
             return
         make_folder(self.out)
         for name, text in texts.items():

@@ -11,7 +11,7 @@ import shapely
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.lots import read_lot, write_lot
@@ -121,17 +121,16 @@ COLUMNS = (
 def lot_files(places: Sequence[Path]) -> list[Path]:
     files: list[Path] = []
     for place in places:
-        if not place.exists():
-            raise InputError(
-                f"{place}: no such file or folder, want a lot (.geojson, .yml) or a folder of lots"
-            )
+        require(
+            place.exists(),
+            f"{place}: no such file or folder, want a lot (.geojson, .yml) or a folder of lots",
+        )
         lots = (
             sorted(path for path in place.iterdir() if path.suffix == ".geojson")
             if place.is_dir()
             else [place]
         )
-        if not lots:
-            raise InputError(f"{place}: holds no lot (.geojson)")
+        require(lots, f"{place}: holds no lot (.geojson)")
         files += lots
     return files
 

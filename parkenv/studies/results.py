@@ -136,9 +136,11 @@ def read_settings(folder: Path) -> Row | None:
     file = folder / SETTINGS
     if not file.exists():
         return None
-    settings = read_json(file)
-    if not isinstance(settings, dict):
-        raise InputError(f"{file}: want the settings of a command, by name, got a {type(settings).__name__}")
+    settings: Row = read_json(file)
+    require(
+        isinstance(settings, dict),
+        f"{file}: want the settings of a command, by name, got a {type(settings).__name__}",
+    )
     return settings
 
 

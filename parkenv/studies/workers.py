@@ -25,7 +25,7 @@ from joblib import Parallel, cpu_count, delayed
 from joblib.externals.loky import process_executor, reusable_executor
 from joblib.externals.loky.backend import resource_tracker
 
-from parkenv.errors import InputError, require_one_of, with_extra
+from parkenv.errors import InputError, require, require_one_of, with_extra
 from parkenv.files.known_names import BackendName
 
 BACKENDS = get_args(BackendName)
@@ -57,10 +57,11 @@ class Workers:
 
     def __init__(self, jobs: int | None = 1, backend: str = "loky", address: str | None = None) -> None:
         require_one_of("backend", backend, BACKENDS)
-        if address is not None and backend == "loky":
-            raise InputError("address requires the backend ray or dask; loky works on this machine alone")
-        if jobs is not None and jobs < 1:
-            raise InputError(f"jobs is {jobs}, want at least 1, or None for all cores")
+        require(
+            address is None or backend != "loky",
+            "address requires the backend ray or dask; loky works on this machine alone",
+        )
+        require(jobs is None or jobs >= 1, f"jobs is {jobs}, want at least 1, or None for all cores")
         self.jobs, self.backend, self.address = min(jobs or cpu_count(), cpu_count()), backend, address
         self._open = ExitStack()
         self._run: Callable[[dict[int, Task[Any]]], Generator[tuple[int, Any]]] = self._run_by_loky

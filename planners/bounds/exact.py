@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
@@ -133,8 +133,10 @@ class ExactSolution:
         n = problem.lot.n_slots
         require_small(problem)
         p = np.asarray(p_occupied, dtype=np.float64)
-        if p.shape != (n,) or not ((p >= 0.0) & (p <= 1.0)).all():
-            raise InputError(f"p_occupied has shape {p.shape}, want {n} probabilities")
+        require(
+            p.shape == (n,) and ((p >= 0.0) & (p <= 1.0)).all(),
+            f"p_occupied has shape {p.shape}, want {n} probabilities",
+        )
         days = Days.of(p, problem.walk_s, day_error)
         self._lot = _small_lot(problem, days, table or RoadTable.of(problem))
         seen_bits = 0 if seen is None else bits_of(seen)
@@ -205,24 +207,23 @@ class ExactSolution:
                     pending[more].append(new[levels == more])
                     if len(pending[more]) > 32:
                         pending[more] = [np.unique(np.concatenate(pending[more]))]
-            if total > most_states:
-                raise InputError(
-                    f"this lot has over {most_states} belief states: want fewer slots than {n} (about 20 along one "
-                    "aisle, 16 along two, 11 where days differ), or a higher most_states"
-                )
+            require(
+                total <= most_states,
+                f"this lot has over {most_states} belief states: want fewer slots than {n} (about 20 along one "
+                "aisle, 16 along two, 11 where days differ), or a higher most_states",
+            )
         self._keys = np.concatenate(levels_keys)
         self._levels = np.cumsum([0, *(len(keys) for keys in levels_keys)])
 
 
 def require_small(problem: SearchProblem) -> None:
     lot = problem.lot
-    if lot.n_slots > MOST_SLOTS or lot.n_vertices > 1 << _POSITION_BITS:
-        raise InputError(
-            f"lot {lot.name!r} has {lot.n_slots} slots and {lot.n_vertices} vertices; the exact planner takes at most "
-            f"{MOST_SLOTS} slots and {1 << _POSITION_BITS} vertices"
-        )
-    if not problem.sensor_model.perfect:
-        raise InputError("the exact planner requires a sensor model without errors")
+    require(
+        lot.n_slots <= MOST_SLOTS and lot.n_vertices <= 1 << _POSITION_BITS,
+        f"lot {lot.name!r} has {lot.n_slots} slots and {lot.n_vertices} vertices; the exact planner takes at most "
+        f"{MOST_SLOTS} slots and {1 << _POSITION_BITS} vertices",
+    )
+    require(problem.sensor_model.perfect, "the exact planner requires a sensor model without errors")
 
 
 def bits_of(slots: NDArray[np.bool_]) -> int:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.road_users import is_blocked
 from parkenv.driving.vehicle import VehicleParameters
-from parkenv.errors import InputError
+from parkenv.errors import require
 from planners.agent import predict_each
 from planners.driving.car_path import CarPath
 from planners.driving.hybrid_astar import SearchSettings, plan_path, why_no_path
@@ -104,10 +104,10 @@ class ParkingAgent:
     def require_map(self, observation: Observation) -> None:
         """Raise an `InputError` unless observations have the obstacle map and are of the agent's own vehicle."""
         for key in ("cars", "lines", "vehicle"):
-            if key not in observation:
-                raise InputError(
-                    f"the observation has no {key!r}: make the environment with obstacle_map=True"
-                )
+            require(
+                key in observation,
+                f"the observation has no {key!r}: make the environment with obstacle_map=True",
+            )
         self.vehicle.require_same(observation["vehicle"], f"agent {self.name!r}")
 
     def plan(self, observation: Observation, *, around_others: bool = False) -> CarPath | None:

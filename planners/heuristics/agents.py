@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED, SlotBelief
 from parkenv.engine.policy import CompiledPolicy, PolicyData
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
@@ -141,10 +141,10 @@ class FirstFreeAgent(TargetAgent):
         self.within_m = within_m
         super().__init__(problem)
         least_m = self.problem.arrival_cost_s.min() * self.problem.v_walk
-        if within_m is not None and not within_m >= least_m:
-            raise InputError(
-                f"within_m is {within_m}, want at least {least_m:.1f}, the shortest walk of the lot"
-            )
+        require(
+            within_m is None or within_m >= least_m,
+            f"within_m is {within_m}, want at least {least_m:.1f}, the shortest walk of the lot",
+        )
 
 
 class UsualAgent(TargetAgent):

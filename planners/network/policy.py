@@ -17,7 +17,7 @@ from pydantic import Field, JsonValue
 
 from parkenv.compiled.arrays import Float32Array
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
@@ -92,19 +92,23 @@ class NetworkPolicy(NamedTuple):
         """
         data = read_bytes(Path(path), _MAX_BYTES)
         content, tensors, body = read_header(data, path)
-        if content.get("format") != FORMAT:
-            raise InputError(f"{path}: has no card of a network; want a file of weights of `network`")
+        require(
+            content.get("format") == FORMAT,
+            f"{path}: has no card of a network; want a file of weights of `network`",
+        )
         card = NetworkCard.parse(content, f"{path}: card")
         layout = card.layout()
-        if tensors != layout or len(body) < max(e["data_offsets"][1] for e in layout.values()):
-            raise InputError(
-                f"{path}: has not the weights of its card, {card.token_width} and {card.width} wide"
-            )
+        require(
+            tensors == layout and len(body) >= max(e["data_offsets"][1] for e in layout.values()),
+            f"{path}: has not the weights of its card, {card.token_width} and {card.width} wide",
+        )
         weights = {}
         for name, entry in layout.items():
             values = np.frombuffer(body[slice(*entry["data_offsets"])], "<f4").reshape(entry["shape"])
-            if not (np.abs(values) <= _MAX_WEIGHT).all():
-                raise InputError(f"{path}: {name} has weights that are no numbers, or above {_MAX_WEIGHT:g}")
+            require(
+                (np.abs(values) <= _MAX_WEIGHT).all(),
+                f"{path}: {name} has weights that are no numbers, or above {_MAX_WEIGHT:g}",
+            )
             weights[name] = values.astype(np.float32)
         return cls(card, weights)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, require_number
+from parkenv.errors import require, require_number
 from parkenv.world.lot import ACTIONS, MOVES, PARK
 from parkenv.world.scenario import SearchProblem
 
@@ -90,15 +90,17 @@ class ParkingMDP:
             ("p_free", p_free, (n,)),
             ("arrival_cost_s", arrival_cost_s, (n,)),
         ):
-            if array.shape != wanted:
-                raise InputError(f"{name} has shape {array.shape}, want {wanted}")
+            require(array.shape == wanted, f"{name} has shape {array.shape}, want {wanted}")
             object.__setattr__(self, name, array)
-        if n == 0 or neighbors.max() >= n or neighbors.min() < -1:
-            raise InputError(f"neighbors must hold vertices 0..{n - 1}, or -1 where there is no edge")
-        if not ((p_free >= 0.0) & (p_free <= 1.0)).all():
-            raise InputError("p_free must lie in [0, 1]")
-        if not (np.isfinite(arrival_cost_s).all() and (move_s[neighbors >= 0] >= 0.0).all()):
-            raise InputError("arrival_cost_s must be finite and move_s not negative")
+        require(
+            n > 0 and neighbors.max() < n and neighbors.min() >= -1,
+            f"neighbors must hold vertices 0..{n - 1}, or -1 where there is no edge",
+        )
+        require(((p_free >= 0.0) & (p_free <= 1.0)).all(), "p_free must lie in [0, 1]")
+        require(
+            np.isfinite(arrival_cost_s).all() and (move_s[neighbors >= 0] >= 0.0).all(),
+            "arrival_cost_s must be finite and move_s not negative",
+        )
         for name in ("failure_s", "wait_s"):
             require_number(name, getattr(self, name), least=0.0)
         require_number("gamma", self.gamma, above=0.0, most=1.0)

@@ -10,7 +10,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.world.lot import PARK
 from planners.thesis.mdp import ParkingMDP
 
@@ -41,16 +41,15 @@ def policy_iteration(
         InputError: gamma is 1, or the policy has the wrong shape.
         RuntimeError: not converged within `max_iterations`.
     """
-    if mdp.gamma >= 1.0:
-        raise InputError(
-            "policy iteration needs gamma below 1: else a policy that never parks has no finite value"
-        )
+    require(
+        mdp.gamma < 1.0,
+        "policy iteration needs gamma below 1: else a policy that never parks has no finite value",
+    )
     n = mdp.n_states
     state = np.arange(n)
     rewards, successors, continuation = mdp.rewards(), mdp.successors(), mdp.continuation()
     policy = np.full(n, PARK, dtype=np.int64) if policy is None else np.array(policy, dtype=np.int64)
-    if policy.shape != (n,):
-        raise InputError(f"policy has shape {policy.shape}, want ({n},)")
+    require(policy.shape == (n,), f"policy has shape {policy.shape}, want ({n},)")
     for iteration in range(1, max_iterations + 1):
         weights = np.concatenate([np.ones(n), -continuation[state, policy]])
         entries = np.concatenate([state, state]), np.concatenate([state, successors[state, policy]])

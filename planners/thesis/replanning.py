@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError, require_one_of
+from parkenv.errors import require, require_one_of
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import nearness
 from parkenv.world.scenario import SearchProblem
@@ -74,8 +74,10 @@ class StaticAgent(SearchAgent[Plan]):
     ) -> None:
         super().__init__(problem)
         require_one_of("solver", solver, SOLVERS)
-        if solver == "policy_iteration" and gamma == 1.0:
-            raise InputError(f"gamma is {gamma}, want below 1 for the solver policy_iteration")
+        require(
+            solver != "policy_iteration" or gamma != 1.0,
+            f"gamma is {gamma}, want below 1 for the solver policy_iteration",
+        )
         self.failure_s = problem.failure_s if failure_s is None else failure_s
         self.solver = solver
         nothing_free = np.ones(problem.lot.n_slots)

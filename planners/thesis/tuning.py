@@ -20,7 +20,7 @@ from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.keyed_random import OBSERVATION_STREAM, VIEW_STREAM, keyed_uniform
-from parkenv.errors import InputError, require_whole
+from parkenv.errors import require, require_whole
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.scenario import SearchProblem
@@ -82,10 +82,14 @@ def tune_failure_cost(
     """
     p = np.asarray(p_occupied, dtype=np.float64)
     compared = np.asarray(costs, dtype=np.float64)
-    if p.shape != (problem.lot.n_slots,) or not ((p >= 0.0) & (p <= 1.0)).all():
-        raise InputError(f"p_occupied has shape {p.shape}, want {problem.lot.n_slots} probabilities")
-    if not len(compared) or not (np.isfinite(compared) & (compared > 0.0)).all():
-        raise InputError(f"costs are {list(costs)}, want finite seconds above 0")
+    require(
+        p.shape == (problem.lot.n_slots,) and ((p >= 0.0) & (p <= 1.0)).all(),
+        f"p_occupied has shape {p.shape}, want {problem.lot.n_slots} probabilities",
+    )
+    require(
+        len(compared) and (np.isfinite(compared) & (compared > 0.0)).all(),
+        f"costs are {list(costs)}, want finite seconds above 0",
+    )
     require_whole("worlds", worlds, least=1)
     near = near or Neighborhoods(problem).toward(vertex)
     here = near.index(vertex)

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.drivable_area import JOINED_WHOLE
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.files.atomic_write import atomic_write
 from parkenv.show.figures.picture_files import STYLE
 from parkenv.show.painters.axes import draw_scale_bar, paint, points_per_m
@@ -182,10 +182,10 @@ def save_lot_picture(
         draw_lot(lot, ax, show_graph=show_graph)
     _draw_guesses(lot, ax, guesses)
     formats = figure.canvas.get_supported_filetypes()
-    if path.suffix.removeprefix(".") not in formats:
-        raise InputError(
-            f"{path}: no picture format {path.suffix!r}, want one of {', '.join(sorted(formats))}"
-        )
+    require(
+        path.suffix.removeprefix(".") in formats,
+        f"{path}: no picture format {path.suffix!r}, want one of {', '.join(sorted(formats))}",
+    )
     with atomic_write(path) as beside:
         figure.savefig(
             beside, format=path.suffix.removeprefix("."), dpi=160, bbox_inches="tight", pad_inches=0.0

@@ -18,7 +18,7 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from parkenv.engine.search_record import SearchRecord
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.show.figures.charts import key_line
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE
@@ -124,8 +124,7 @@ def _text_marker(text: str) -> MplPath:
 
 
 def draw_searches(records: Sequence[SearchRecord]) -> Figure:
-    if not records:
-        raise InputError("no search to draw")
+    require(records, "no search to draw")
     bounds = np.array([record.scenario.lot.bounds() for record in records])
     across, up = (bounds[:, 2:] - bounds[:, :2]).T
     aspect = float(

@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.files.known_names import UNBEATEN
 from parkenv.show.figures.charts import (
     BOLD,
@@ -227,8 +227,7 @@ def _name_ends(ends: Sequence[tuple[float, float, str]], limit: float, ax: Axes)
 
 @mpl.rc_context(STYLE)
 def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
-    if not panels or not any(panels.values()):
-        raise InputError("no total times to draw")
+    require(panels and any(panels.values()), "no total times to draw")
     columns = len(panels) if len(panels) < 4 else 2 if len(panels) == 4 else 3
     names = list(dict.fromkeys(name for totals in panels.values() for name in totals))
     width, mean = (4.6, 7.2, 9.6)[columns - 1], "mean (▸ beyond the axis)"
@@ -281,8 +280,7 @@ def _distribution(totals: Totals, title: str) -> Panel:
 
 
 def _limit(rows: Sequence[Row]) -> float:
-    if not rows:
-        raise InputError("no rows to draw")
+    require(rows, "no rows to draw")
     total = np.array([row["total_s"] for row in rows])
     return float(1.12 * total[total <= OFF_SCALE * np.median(total)].max()) or 1.0
 

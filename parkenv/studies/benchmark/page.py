@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.show.report.page import Page, page_data
 from parkenv.show.tables import Column, shared, table_of
 from parkenv.studies.benchmark.study import RESULT, Benchmark, score_table
@@ -37,8 +37,10 @@ _WHO = (
 def result_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    if not (files := sorted(path.rglob(RESULT)) or sorted(path.rglob("*.json"))):
-        raise InputError(f"{path}: no {RESULT} below it")
+    require(
+        (files := (sorted(path.rglob(RESULT)) or sorted(path.rglob("*.json")))),
+        f"{path}: no {RESULT} below it",
+    )
     return files
 
 
@@ -55,8 +57,10 @@ def entries_of(results: Sequence[Row]) -> list[Entry]:
     entries = []
     for result in results:
         for agent, tasks in result["episodes"].items():
-            if agent.partition("(")[0] not in AGENTS and not result["code"].startswith(ADDRESSES):
-                raise InputError(f"code is {result['code']!r}, want the address of the code of {agent}")
+            require(
+                agent.partition("(")[0] in AGENTS or result["code"].startswith(ADDRESSES),
+                f"code is {result['code']!r}, want the address of the code of {agent}",
+            )
             times = {task: np.array(searches["total_s"]) for task, searches in tasks.items()}
             entries.append(Entry(agent, result, times))
     return sorted(entries, key=lambda entry: -entry.result["scores"][entry.agent])
@@ -108,8 +112,7 @@ def neighbours(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
 
 def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, Any]:
     names = sorted({result["suite"] for result in results})
-    if len(names) > 1:
-        raise InputError(f"results are of the suites {', '.join(names)}, want those of one on a page")
+    require(len(names) <= 1, f"results are of the suites {', '.join(names)}, want those of one on a page")
     suite, entries = Suite.packaged(results[0]["suite"]), entries_of(results)
     commands = [
         {"agent": ", ".join(result["episodes"]), "command": shlex.join(result["command"])} | _origin(result)

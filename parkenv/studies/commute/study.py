@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.files.known_names import MapName
 from parkenv.files.option import option
 from parkenv.files.spec_file import Axis
@@ -153,8 +153,7 @@ class Commute(Study):
             for agent in self.agents:
                 make_agent(agent.name, scenario, **agent.options)
         name, count = Counter(tuple(run.columns.values()) for run in self.runs).most_common(1)[0]
-        if count > 1:
-            raise InputError(f"two agents are called {name[2]!r}, want different names")
+        require(count <= 1, f"two agents are called {name[2]!r}, want different names")
         for run in self.runs[:: self.drivers]:
             run.start_map()
 

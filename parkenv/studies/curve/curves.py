@@ -22,7 +22,7 @@ from scipy.optimize import nnls
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.errors import InputError, nearest, with_extra
+from parkenv.errors import InputError, nearest, require, with_extra
 from parkenv.files.atomic_write import write_text
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.limited_reading import read_json
@@ -413,8 +413,7 @@ class Curves:
 
     def __init__(self, curves: Mapping[tuple[str, ...], Mapping[str, Sequence[float]]]) -> None:
         self.curves = dict(curves)
-        if not self.curves:
-            raise InputError("curves is empty, want at least one")
+        require(self.curves, "curves is empty, want at least one")
 
     def at(
         self,
@@ -441,8 +440,10 @@ class Curves:
         Raises:
             InputError: both or neither of occupancy and demand are given, or there is no such outcome or curve.
         """
-        if (occupancy is None) == (demand is None):
-            raise InputError("occupancy and demand are both given or both missing, want one of them")
+        require(
+            (occupancy is None) != (demand is None),
+            "occupancy and demand are both given or both missing, want one of them",
+        )
         along, given = ("occupancy", occupancy) if demand is None else ("demand", demand)
         first = next(iter(self.curves))[0] if scenario is None else scenario
         x, *names = np.broadcast_arrays(np.asarray(given, float), first, zone, purpose, hour)
@@ -450,8 +451,7 @@ class Curves:
         asked = np.stack([of_axis.astype(str) for of_axis in names], axis=-1)
         for key in {*map(tuple, asked.reshape(-1, len(NAMES)).tolist())}:
             at, curve = (asked == key).all(axis=-1), self._curve(key)
-            if outcome not in curve:
-                raise InputError(f"outcome is {outcome!r:.40}; {nearest(outcome, OUTCOMES)}")
+            require(outcome in curve, f"outcome is {outcome!r:.40}; {nearest(outcome, OUTCOMES)}")
             knots, unique = np.unique(np.array(curve[along], float), return_index=True)
             inside = np.clip(x[at], knots[0], knots[-1])
             for k, column in enumerate((outcome, f"{outcome}_low", f"{outcome}_high")):
@@ -462,8 +462,7 @@ class Curves:
     def _curve(self, key: tuple[str, ...]) -> Mapping[str, Sequence[float]]:
         if key not in self.curves:
             for part, name, known in zip(NAMES, key, zip(*self.curves, strict=True), strict=True):
-                if name not in known:
-                    raise InputError(f"{part} is {name!r}; {nearest(name, dict.fromkeys(known))}")
+                require(name in known, f"{part} is {name!r}; {nearest(name, dict.fromkeys(known))}")
             raise InputError(f"{', '.join(key)}: no cars come, so there is no curve")
         return self.curves[key]
 

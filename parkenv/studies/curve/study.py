@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.files.file_names import file_name
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.scenarios.spec import scenario_spec
@@ -136,10 +136,13 @@ class CurveStudy(FleetSpec):
 
     def check(self) -> None:
         for name, values in (("agents", self.drivers), ("knows", self.knowledge), ("shares", self.shares)):
-            if len(values) > 1:
-                raise InputError(f"{name} has {len(values)} values, want one: a curve is of equal drivers")
-        if len({isinstance(rate, str) for rate in self.demands}) > 1:
-            raise InputError(f"arrivals_per_hour is {self.demands}, want either multiples or cars an hour")
+            require(
+                len(values) <= 1, f"{name} has {len(values)} values, want one: a curve is of equal drivers"
+            )
+        require(
+            len({isinstance(rate, str) for rate in self.demands}) <= 1,
+            f"arrivals_per_hour is {self.demands}, want either multiples or cars an hour",
+        )
         super().check()
 
     def settings(self) -> Row:

@@ -9,7 +9,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.forecast.comparison import last_week
 from parkenv.forecast.counts import Counts
 from parkenv.scenarios.build import build, demand_of
@@ -34,16 +34,18 @@ class CountedTown:
         self.spec, self.policy = spec, compiled_policy_of(agent, self.scenario)
         self._fleet: Fleet | None = None
         lot, window = self.scenario.lot, self.scenario.arrival
-        if window.start_s % HOUR_S or window.end_s % HOUR_S or window.end_s <= window.start_s:
-            raise InputError("arrivals.hours are not full hours, want those that counts are made in")
+        require(
+            not (window.start_s % HOUR_S or window.end_s % HOUR_S or window.end_s <= window.start_s),
+            "arrivals.hours are not full hours, want those that counts are made in",
+        )
         slots = {lot.slot_ids[slot]: slot for slot in np.flatnonzero(lot.is_counted).tolist()}
         self.names = [name for name in counts.car_parks if name in slots]
         self.others = [name for name in counts.car_parks if name not in slots]
-        if not self.names:
-            raise InputError(
-                f"{counts.source}: none of its car parks is a counted facility of lot {lot.name!r}; want names of "
-                f"{', '.join(slots) or 'such ones'}"
-            )
+        require(
+            self.names,
+            f"{counts.source}: none of its car parks is a counted facility of lot {lot.name!r}; want names of "
+            f"{', '.join(slots) or 'such ones'}",
+        )
         self.slots: IntArray = np.array([slots[name] for name in self.names])
         self.capacity = lot.capacity[self.slots].astype(np.float64)
         self.hours = (hours_between(window.start_s, window.end_s)[:-1] // HOUR_S).astype(np.int64)

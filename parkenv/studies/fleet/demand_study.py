@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.files.option import option
 from parkenv.files.spec_file import FilePath
 from parkenv.scenarios.spec import TIMEZONE_HELP, Date, PurposeSpec, scenario_spec
@@ -132,15 +132,15 @@ class DemandStudy(Study):
 
     def check(self) -> None:
         counts = self.town.counts
-        if not 0 < counts.day_index(self._first + timedelta(weeks=self.weeks)) < len(counts.days):
-            raise InputError(
-                f"--from is {self._first}: {counts.source} has counts from {counts.days[0]} to {counts.days[-1]}, "
-                f"want {plural(self.weeks, 'week')} and days after these among them"
-            )
-        if not len(self.days(self.roll_outs - 1)[1]):
-            raise InputError(
-                f"roll_outs is {self.roll_outs}, want fewer: {counts.source} ends with {counts.days[-1]}"
-            )
+        require(
+            0 < counts.day_index(self._first + timedelta(weeks=self.weeks)) < len(counts.days),
+            f"--from is {self._first}: {counts.source} has counts from {counts.days[0]} to {counts.days[-1]}, "
+            f"want {plural(self.weeks, 'week')} and days after these among them",
+        )
+        require(
+            len(self.days(self.roll_outs - 1)[1]),
+            f"roll_outs is {self.roll_outs}, want fewer: {counts.source} ends with {counts.days[-1]}",
+        )
 
     def settings(self) -> Row:
         more = ("weeks", "held_out", "rounds", "episodes", "timezone", "seed")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.network import compiled_network
 from parkenv.engine.policy import CompiledPolicy
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.known_names import SAME_SLOTS
 from parkenv.scenarios.build import build
@@ -59,8 +59,10 @@ def policy_of(
     agent = make_agent(spec.name, scenario, **known | spec.options)
     if spec.name in POLICIES and isinstance(agent, TargetAgent):
         return agent.compiled_policy(), None
-    if isinstance(agent, ClairvoyantAgent):
-        raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
+    require(
+        not isinstance(agent, ClairvoyantAgent),
+        f"agent {spec.label!r} knows the future of single searches, and drives no fleet",
+    )
     plain = isinstance(agent, LearnedAgent) and not agent.normalization.tensors
     if isinstance(agent, LearnedAgent) and plain and agent.card.algorithm != "recurrent-ppo":
         sampled = agent.card.algorithm != "dqn"
@@ -85,11 +87,11 @@ def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "n
         parts = []
     linear = [part for part in parts if isinstance(part, nn.Linear)]
     others = {type(part).__name__.lower() for part in parts if not isinstance(part, nn.Linear)}
-    if not linear or len(others) > 1 or not others <= {"tanh", "relu"}:
-        raise InputError(
-            f"policy is a {type(policy).__name__} with {', '.join(sorted(others)) or 'no layers'}, want a multilayer "
-            "perceptron of PPO, MaskablePPO or DQN with tanh or relu"
-        )
+    require(
+        linear and len(others) <= 1 and (others <= {"tanh", "relu"}),
+        f"policy is a {type(policy).__name__} with {', '.join(sorted(others)) or 'no layers'}, want a multilayer "
+        "perceptron of PPO, MaskablePPO or DQN with tanh or relu",
+    )
     layers = [(part.weight.detach().cpu().numpy(), part.bias.detach().cpu().numpy()) for part in linear]
     activation, masked = others.pop() if others else "tanh", type(policy).__name__.startswith("Maskable")
     return compiled_network(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
@@ -125,13 +127,15 @@ def demand_in(
     exponential; in a lot with weights, cars choose entries and goals by these, else they go to the scenario's goal.
     """
     window, own = scenario.arrival, scenario.demand
-    if window.end_s <= window.start_s:
-        raise InputError(
-            f"the arrivals of {scenario.name!r} are at one time, want hours in which cars arrive; "
-            "set --hours, e.g. 08:00-12:00"
-        )
-    if own is None and per_hour == GIVEN:
-        raise InputError(f"scenario {scenario.name!r} has no demand of its own, want cars an hour")
+    require(
+        window.end_s > window.start_s,
+        f"the arrivals of {scenario.name!r} are at one time, want hours in which cars arrive; "
+        "set --hours, e.g. 08:00-12:00",
+    )
+    require(
+        own is not None or per_hour != GIVEN,
+        f"scenario {scenario.name!r} has no demand of its own, want cars an hour",
+    )
     if own is not None and per_hour != COUNTED:
         if isinstance(per_hour, str):
             return own.scaled(times_demanded(per_hour))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, model_validator
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.files.field_types import Probability
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
@@ -271,13 +271,11 @@ class FleetSpec(Study):
     def check(self) -> None:
         (first, scenario), *others = self.built.items()
         for name, other in others:
-            if (other.arrival.start_s, other.arrival.end_s) != (
-                scenario.arrival.start_s,
-                scenario.arrival.end_s,
-            ):
-                raise InputError(
-                    f"arrivals.hours of {name!r} are not those of {first!r}, want equal hours; set --hours 08:00-12:00"
-                )
+            require(
+                (other.arrival.start_s, other.arrival.end_s)
+                == (scenario.arrival.start_s, scenario.arrival.end_s),
+                f"arrivals.hours of {name!r} are not those of {first!r}, want equal hours; set --hours 08:00-12:00",
+            )
         for setting in self.fleet_settings:
             self.fleet(setting)
 

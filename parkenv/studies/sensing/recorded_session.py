@@ -144,10 +144,10 @@ def write_drives(
 def _scenario_of(drive: RecordedDrive) -> Scenario:
     """Return the scenario that a drive of `parkenv survey` was recorded in."""
     name = drive.head.key.partition("/")[0] if drive.head else ""
-    if name not in SCENARIO_NAMES:
-        raise InputError(
-            f"{drive.path}: was not made by parkenv survey; want --lot FILE with its slots, or --discover to find them"
-        )
+    require(
+        name in SCENARIO_NAMES,
+        f"{drive.path}: was not made by parkenv survey; want --lot FILE with its slots, or --discover to find them",
+    )
     return make_scenario(name)
 
 
@@ -218,8 +218,10 @@ def discover_recordings(
         require(drive.key not in known, f"{folder / MAP_FILE}: holds the drive {drive.key!r} already")
         drives.append(reader.locate(drive))
     tracks = [*earlier.tracks, *(one.track for one in drives)]
-    if streets is not None and frame is None:
-        raise InputError(f"{streets}: is in degrees, and the poses are in metres; want poses in degrees")
+    require(
+        streets is None or frame is not None,
+        f"{streets}: is in degrees, and the poses are in metres; want poses in degrees",
+    )
     lanes = driven_lanes(tracks) if streets is None or frame is None else mapped_lanes(streets, frame, tracks)
     cars = [*earlier.cars, *(one.parked for one in drives)]
     found = discover_street(cars, tracks, lambda slots: _shown_free(slots, lanes, drives))

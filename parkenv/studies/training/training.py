@@ -533,10 +533,10 @@ def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> 
     require_different_names([*learned, *held_out])
     shares = {lot_share(scenario.lot): scenario.name for scenario in learned}
     for scenario in held_out:
-        if (same := shares.get(lot_share(scenario.lot))) is not None:
-            raise InputError(
-                f"evaluate_on has {scenario.name!r}, whose lot is that of {same!r}, which is trained on"
-            )
+        require(
+            (same := shares.get(lot_share(scenario.lot))) is None,
+            f"evaluate_on has {scenario.name!r}, whose lot is that of {same!r}, which is trained on",
+        )
 
 
 def _places(scenarios: Sequence[Scenario]) -> str:
