@@ -88,15 +88,10 @@ PANELS = ("Options", "Costs and speeds", "World", "Sensors", "Results", "Trust",
 
 
 class Entry(NamedTuple):
-    """A line of the list of commands.
+    """A line of the list of commands."""
 
-    Attributes:
-        summary: what the command does, in a sentence.
-        source: its class, `MODULE:CLASS` below `parkenv.cli`, or its kind of study; empty for a group of commands.
-        heading: what it stands under.
-    """
-
-    summary: str
+    summary: str  # what the command does, in a sentence
+    # its class, `MODULE:CLASS` below `parkenv.cli`, or its kind of study; empty for a group of commands
     source: str = ""
     heading: str = "Commands"
 

@@ -28,11 +28,7 @@ Given = Mapping[str, Any]
 
 
 class Command(Spec):
-    """A command: its fields are its arguments and options, and its docstring is part of its help page.
-
-    Attributes:
-        examples: command lines for the help page.
-    """
+    """A command: its fields are its arguments and options; its docstring and examples are on its help page."""
 
     examples: ClassVar[str]
 
@@ -54,19 +50,11 @@ def command_class(source: str) -> Any:
 
 @dataclass(frozen=True)
 class FieldOption:
-    """An option of a command: a field of its specification, or of a table in it.
+    """An option of a command: a field of its specification, or of a table in it."""
 
-    Args:
-        path: names of the tables, and of the field.
-        field: the field.
-        option: how it is given on the command line.
-        model: class of the table that the field belongs to.
-    """
-
-    path: tuple[str, ...]
+    path: tuple[str, ...]  # names of the tables, and of the field
     field: FieldInfo
-    option: Option
-    model: type[Spec]
+    option: Option  # how it is given on the command line
 
     @property
     def name(self) -> str:
@@ -153,7 +141,7 @@ def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[Fie
         marks = {mark.name: mark for mark in field.metadata if isinstance(mark, Option)}
         if not marks and name in of_command and not any(models_in(field.annotation)):
             marks = {"": Option()}
-        own += [FieldOption((*path, name), field, mark, model) for mark in marks.values()]
+        own += [FieldOption((*path, name), field, mark) for mark in marks.values()]
     names = {option.name for option in own}
     for name, field in model.model_fields.items():
         yield from (option for option in own if option.path[-1] == name)

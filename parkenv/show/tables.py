@@ -52,31 +52,20 @@ SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # columns of a s
 
 
 class Column(NamedTuple):
-    """Format of a column.
+    """Format of a column."""
 
-    Attributes:
-        key: key in the summary.
-        label: heading.
-        unit: unit of the numbers; empty for none.
-        digits: number of decimals.
-        share: whether the value is a fraction, shown as a percentage.
-        signed: whether positive values get a plus sign.
-        help: explanation.
-        given: whether the numbers were chosen, and keep all their digits.
-        setting: whether the value stands above the table if it is equal in all rows, as measures never do.
-        needs: column that must differ from 0 in some row for this one to be shown.
-    """
-
-    key: str
-    label: str
-    unit: str = ""
-    digits: int = 1
-    share: bool = False
-    signed: bool = False
-    help: str = ""
-    given: bool = False
-    setting: bool = False
-    needs: str = ""
+    key: str  # in the summary
+    label: str  # heading
+    unit: str = ""  # of the numbers; empty for none
+    digits: int = 1  # number of decimals
+    share: bool = False  # whether the value is a fraction, shown as a percentage
+    signed: bool = False  # whether positive values get a plus sign
+    help: str = ""  # explanation
+    given: bool = False  # whether the numbers were chosen, and keep all their digits
+    setting: bool = (
+        False  # whether it stands above the table if it is equal in all rows, as measures never do
+    )
+    needs: str = ""  # column that must differ from 0 in some row for this one to be shown
 
 
 # Columns of searches, in the order of tables.
@@ -146,12 +135,8 @@ def table_of(
     into the column of their value. Settings that are equal in all rows go to `same`, which is printed above the table.
     `leads` holds the numbers of the rows whose agent leads, `unbeaten` those of `UNBEATEN`.
 
-    Args:
-        name: identifier of the table in the page.
-        title: title above the table.
-        rows: rows with mostly the same keys.
-        columns: columns of the study, which replace and precede those of `SHARED`.
-        facts: whether to show a single row from top to bottom.
+    The study's `columns` replace and precede those of `SHARED`; `facts` shows a single row from top to bottom. Pages
+    know the table by its `name`.
     """
     flat = [_flat(row) for row in rows]
     present = {key: None for row in flat for key in row if key != "leads"}

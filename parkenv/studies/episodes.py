@@ -56,11 +56,7 @@ class SearchRecorder(Observer):
 
 
 class TripRecorder(Observer):
-    """Collects the observations of one search, for a map that learns from it.
-
-    Attributes:
-        observations: those of each step.
-    """
+    """Collects the observations of each step of a search, for a map that learns from it."""
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         self.observations: list[Observations] = []
@@ -75,14 +71,9 @@ class TripRecorder(Observer):
 
 
 class EpisodeRunner:
-    """Runs episodes of one agent in one scenario.
+    """Runs episodes of one agent, which has a `name` in records, in one scenario.
 
-    Args:
-        scenario: the scenario, with the costs and speeds of the setting.
-        name: name of the agent, for the record.
-        agent: the agent.
-        rig: sensor rig of the car; None for the scenario's sensor model; see `make_search`.
-        detector, every: detector and distance between captures, m, for `parkenv/SearchPerception-v2`; None for its own.
+    With a `rig`, slots are observed in `parkenv/SearchPerception-v2`, with its `detector` and captures `every` metre.
     """
 
     def __init__(

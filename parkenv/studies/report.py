@@ -42,19 +42,12 @@ class Summary(Spec, extra="allow"):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A finished run.
-
-    Attributes:
-        path: the folder.
-        summary: content of `summary.json`.
-        kind: compare, survey, demo, train, ...; the command's name if the folder holds no specification.
-        page: what its study says about it.
-    """
+    """A finished run."""
 
     path: Path
-    summary: Mapping[str, Any]
-    kind: str
-    page: Page
+    summary: Mapping[str, Any]  # content of `summary.json`
+    kind: str  # compare, survey, ...; the command's name if the folder holds no specification
+    page: Page  # what its study says about it
 
     @classmethod
     def read(cls, path: Path) -> Self:

@@ -63,20 +63,14 @@ STORE = "results.sqlite"
 class Table:
     """A table of a run, stored under the name of the file that is written from it at the end.
 
-    Args:
-        file: name of the file: a CSV table; or `.jsonl` for whole rows, a JSON object in each line.
-        keys: columns that identify a row.
-        columns: the other columns of the file.
-        lists: name of a second file, and its columns, which hold a list for each row as a text, such as the wall times
-            of decisions; None for none.
-        long: whether a row has many lines of the file: each of `columns` is a list with a value for each of them.
+    A second file may have `lists`: columns with a list for each row as a text, such as the wall times of decisions.
     """
 
-    file: str
-    keys: Sequence[str]
-    columns: Sequence[str] = ()
-    long: bool = False
-    lists: tuple[str, Sequence[str]] | None = None
+    file: str  # name of the file: a CSV table; or `.jsonl` for whole rows, a JSON object in each line
+    keys: Sequence[str]  # columns that identify a row
+    columns: Sequence[str] = ()  # the other columns of the file
+    long: bool = False  # whether a row has many lines of the file, and each of `columns` a list of them
+    lists: tuple[str, Sequence[str]] | None = None  # name of the second file, and its columns
 
     def key(self, row: Mapping[str, Any]) -> Key:
         return tuple(row[c] for c in self.keys)

@@ -116,17 +116,11 @@ def success_columns(name: str, successes: int, trials: int) -> dict[str, Any]:
 
 
 class Estimate(NamedTuple):
-    """An estimated mean.
-
-    Attributes:
-        mean: the mean.
-        error: its standard error.
-        freedom: degrees of freedom of the standard error.
-    """
+    """An estimated mean."""
 
     mean: float
-    error: float
-    freedom: float
+    error: float  # its standard error
+    freedom: float  # degrees of freedom of the standard error
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float, float]:
         """Return the mean and the ends of its interval (Student's t)."""

@@ -119,15 +119,10 @@ Recording = dict[str, Any]
 
 
 class ReplayJob(NamedTuple):
-    """Searches, drives or days to run again for a page.
-
-    Attributes:
-        tasks: each returns a recording.
-        notes: what is left out, and why.
-    """
+    """Searches, drives or days to run again for a page."""
 
     tasks: Sequence[Task[Recording]] = ()
-    notes: Sequence[str] = ()
+    notes: Sequence[str] = ()  # what is left out, and why
 
 
 class NotInRunError(InputError):
@@ -323,15 +318,9 @@ class Study(ExecutionSpec):
 
 
 class Stage(NamedTuple):
-    """Cells that may run at the same time.
+    """Cells of a study that may run at the same time."""
 
-    Attributes:
-        doing: what the progress bar says.
-        study: the study whose cells they are.
-        cells: the cells.
-    """
-
-    doing: str
+    doing: str  # what the progress bar says
     study: Study
     cells: Sequence[Cell]
 

@@ -72,19 +72,12 @@ class Situation(NamedTuple):
 
 
 class Features(NamedTuple):
-    """Observation of the network at one decision.
+    """Observation of the network at one decision."""
 
-    Attributes:
-        actions: (6, ACTION_FEATURES) float32, the four moves, parking, waiting.
-        tokens: (6, CANDIDATES, TOKEN_FEATURES) float32.
-        allowed: (6,) bool, the actions that there are.
-        lookahead_s: (6,) float64, s, expected time by the look-ahead; inf for actions that there are not.
-    """
-
-    actions: NDArray[np.float32]
-    tokens: NDArray[np.float32]
-    allowed: NDArray[np.bool_]
-    lookahead_s: FloatArray
+    actions: NDArray[np.float32]  # (6, ACTION_FEATURES), the four moves, parking, waiting
+    tokens: NDArray[np.float32]  # (6, CANDIDATES, TOKEN_FEATURES)
+    allowed: NDArray[np.bool_]  # (6,), the actions that there are
+    lookahead_s: FloatArray  # (6,) s, expected time by the look-ahead; inf for actions that there are not
 
     @classmethod
     def empty(cls) -> Features:

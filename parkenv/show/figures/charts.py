@@ -84,18 +84,10 @@ def draw_panels(
     key_style: Mapping[str, Any] = {},
     bold: bool = False,
 ) -> Figure:
-    """Draw panels in a grid.
+    """Draw panels in a grid of so many columns, or 0: all panels in a row; the size of the figure is in inches.
 
-    Args:
-        panels: the panels.
-        size: of the figure, inches.
-        columns: of the grid; 0: all panels in a row.
-        title: title of the figure.
-        share: axes that panels share, of "x" and "y"; or "column": x within each column.
-        label: `x`, below the lowest panel of each column, and `y`, beside the first of each row.
-        key: handles of a legend below all panels.
-        key_style: its style.
-        bold: whether the title is bold.
+    Panels `share` the axes "x" and "y"; or "column": x within each column. A `label` `x` stands below the lowest panel
+    of each column, `y` beside the first of each row. The `key` has the handles of a legend below all panels.
     """
     columns = columns or len(panels)
     with mpl.rc_context(STYLE):

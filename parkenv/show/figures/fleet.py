@@ -38,12 +38,7 @@ def save_fleet_figure(
     against demand, if it is known; what members and others gain, if there are several shares and `own`; occupancy by
     hour, simulated and as counted, if that is known.
 
-    Args:
-        rows: of `summarize_days`.
-        closed_form: search time, s, of looking at slots in random order, as a function of the occupancy.
-        title: title of the figure.
-        path: file to write.
-        hours: of `summarize_hours`.
+    Rows are of `summarize_days`, hours of `summarize_hours`. The closed form is a search time, s, by the occupancy.
     """
     whole = [row for row in rows if row["share"] in (0.0, max(row["share"] for row in rows))]
     mixed = any(0.0 < row["share"] < 1.0 for row in rows)
@@ -265,13 +260,8 @@ def save_curves(
     Panels: search time against occupancy with its 95 % band, zone-hours and usual forms; held-out zone-hours, predicted
     against measured; relative errors of the curve and the usual forms; walk; and the share that finds no space, if any.
 
-    Args:
-        curves: columns of the curve of each purpose, all of them first; see `Curves`.
-        points: of `held_out.csv`.
-        errors: of the search time of held-out zones: of `curve` and other predictors, and `chance`.
-        forms: usual forms, fitted to the points.
-        title: title of the figure.
-        path: the PNG to write.
+    The first of the curves (columns of `Curves`) is of all purposes. Points are rows of `held_out.csv`; `errors` are
+    those of the search time of held-out zones: of `curve` and other predictors, and `chance`.
     """
     whole = next(iter(curves.values()))
     occupancy, measured, predicted, cars = (

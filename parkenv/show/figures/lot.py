@@ -68,13 +68,8 @@ def draw_lot(
 ) -> None:
     """Draw a lot from above, to scale, with a scale bar.
 
-    Everything has a z-order below 2 except entries and goals (5), so that later plots lie in between.
-
-    Args:
-        lot: the lot.
-        ax: axes to draw in; sets their limits and aspect, and removes ticks and frame.
-        slot_color: fill of the slots: one colour, or (n_slots, 3 or 4) RGB(A) in 0..1; no fill if None.
-        show_graph: also draw the drive graph, an arrow for every move.
+    The axes get limits and an aspect, and lose ticks and frame. Everything has a z-order below 2 except entries and
+    goals (5), so that later plots lie in between. Slots have one colour, (n_slots, 3 or 4) RGB(A) in 0..1, or none.
     """
     x0, y0, x1, y1 = lot.bounds()
     margin = 3.0 + 0.02 * max(x1 - x0, y1 - y0)

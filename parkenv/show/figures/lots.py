@@ -223,11 +223,8 @@ def _dots(ax: Axes, xy: FloatArray, **style: Any) -> None:
 def save_contact_sheets(lots: Sequence[tuple[str, ParkingLot]], folder: Path) -> list[Path]:
     """Draw lots, 60 in a sheet, into `contact-sheet-1.png` and so on in a folder, and return the files.
 
-    Each has its slots tied to their lanes, one-way lanes with arrows, entries and goals, at a scale of its own.
-
-    Args:
-        lots: captions, whose first line is bold, and lots.
-        folder: the folder.
+    Each has its slots tied to their lanes, one-way lanes with arrows, entries and goals, at a scale of its own, and a
+    caption, whose first line is bold.
     """
     files = []
     for k in range(0, len(lots), LARGEST):

@@ -61,14 +61,9 @@ def save_picture(figure: Figure, path: str | Path, caption: str = "") -> None:
 def save_film(
     frames: Sequence[NDArray[np.uint8]], path: str | Path, *, fps: float, colors: int | None = None
 ) -> None:
-    """Write a looping GIF atomically.
+    """Write frames, RGB (h, w, 3), as a looping GIF, atomically.
 
-    Args:
-        frames: RGB images, (h, w, 3).
-        path: the file to write.
-        fps: frames per second.
-        colors: size of one palette for all frames, which keeps rare colours (for drawings). If None, each frame has
-            its own palette (for photographs).
+    All have one palette of so many `colors`, which keeps rare ones (for drawings); None: each its own (photographs).
     """
     pictures = [Image.fromarray(frame) for frame in frames]
     if colors is not None:

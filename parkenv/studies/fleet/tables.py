@@ -380,10 +380,7 @@ def summarize_changes(
     in each `zone` before, and about those that found no slot, if there are some on each day: those who park gain less
     than the others by any change, as they had luck before. Of several purposes, there is a row of each.
 
-    Args:
-        settings: the days of each setting.
-        prices: of each scenario, the price of an hour in each zone of the lot, in the order of the zones.
-        purposes: of each scenario, those of its own demand, in their order, where there are several.
+    Of each scenario, `prices` are those of an hour in each zone, and `purposes` those of its own demand, if several.
     """
     settings = [
         [day | {c: np.array(day.get(c, "").split(), np.float64) for c in CAR_LISTS} for day in days]

@@ -47,17 +47,9 @@ FILES = "files"  # key of the files of a training in its row
 
 
 class _Seeds(NamedTuple):
-    """The trainings of a study, by seed.
-
-    Attributes:
-        folder: that of the run; a training keeps its checkpoint there.
-        shown: demonstrations to clone.
-        command: command line of the run.
-    """
-
-    folder: Path = Path()
-    shown: Any = None
-    command: tuple[str, ...] = ()
+    folder: Path = Path()  # that of the run; a training keeps its checkpoint there
+    shown: Any = None  # demonstrations to clone
+    command: tuple[str, ...] = ()  # command line of the run
     columns: Row = {}  # noqa: RUF012 - never changed
 
 

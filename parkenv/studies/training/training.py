@@ -85,11 +85,7 @@ Times = tuple[NDArray[np.float64], NDArray[np.bool_]]
 
 
 class Training:
-    """Trainings of a search agent in one scenario or several; the score is the mean total time in held-out worlds.
-
-    Args:
-        spec: specification of the training.
-    """
+    """Trainings of a search agent in one scenario or several; the score is the mean total time in held-out worlds."""
 
     def __init__(self, spec: TrainingSpec) -> None:
         self.spec = spec
@@ -209,14 +205,7 @@ class Training:
         stays, so that a training can be made longer: what depends on how much of it is over, such as the learning
         rate, goes on as at that point of the longer one. A replay buffer begins empty.
 
-        Args:
-            seed: seed of the network and of the worlds.
-            folder: output folder, created if missing.
-            shown: demonstrations to clone first.
-            command: command line, for the model's card.
-
-        Returns:
-            The rows of `curve.csv`.
+        The `command` line stands in the model's card. Return the rows of `curve.csv`.
         """
         folder.mkdir(parents=True, exist_ok=True)
         checkpoint, curve = folder / CHECKPOINT, read_curve(folder / CURVE, self.columns)
@@ -422,12 +411,8 @@ def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
 def episode_times(model: Any, places: Scenario | Sequence[Scenario], seeds: Sequence[int]) -> Times:
     """Run episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
 
-    An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
-
-    Args:
-        model: a stable-baselines3 or sb3-contrib model of the `local` observation.
-        places: scenario to search in; or several, of which each seed draws one.
-        seeds: one episode each.
+    An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`. The model
+    observes `local`; of several places, each seed draws one.
     """
     n = len(seeds)
     k = slots_observed(model.observation_space)
@@ -559,21 +544,13 @@ def require_cloneable(algorithm: str, agent: str, scenario: Scenario) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
-    """Recorded decisions of an agent, for behaviour cloning.
-
-    Args:
-        agent: name of the agent.
-        local: (n, 46 + 8k) float32, observations of `LocalObservation`.
-        masks: (n, 5) int8, action masks.
-        actions: (n,) int64, the agent's actions.
-        times: (n,) float64, s from each decision to the end of the search.
-    """
+    """Recorded decisions of an agent, for behaviour cloning."""
 
     agent: str
-    local: NDArray[np.float32]
-    masks: NDArray[np.int8]
-    actions: NDArray[np.int64]
-    times: NDArray[np.float64]
+    local: NDArray[np.float32]  # (n, 46 + 8k), observations of `LocalObservation`
+    masks: NDArray[np.int8]  # (n, 5), action masks
+    actions: NDArray[np.int64]  # (n,)
+    times: NDArray[np.float64]  # (n,) s from each decision to the end of the search
 
     @classmethod
     def collect(
@@ -602,11 +579,7 @@ class Demonstrations:
 
 
 class _DecisionRecorder(Observer):
-    """Record (local observation, action mask, action, reward) of each decision, for searches that are not truncated.
-
-    Args:
-        local: computes the local observations.
-    """
+    """Record (local observation, action mask, action, reward) of each decision, for searches that are not truncated."""
 
     def __init__(self, local: FollowedSearch) -> None:
         self._local = local
@@ -629,14 +602,7 @@ class _DecisionRecorder(Observer):
 def clone(
     model: OnPolicyAlgorithm, demonstrations: Demonstrations, seed: int, updates: int = UPDATES
 ) -> None:
-    """Fit a model's policy to the demonstrations, and its value function to the remaining search time.
-
-    Args:
-        model: an untrained ppo or maskable-ppo model.
-        demonstrations: decisions to clone.
-        seed: seed of the mini-batches.
-        updates: number of optimizer steps.
-    """
+    """Fit an untrained model's policy to demonstrations, and its value function to the remaining search time."""
     import torch
 
     policy, rng = model.policy, np.random.default_rng(seed)

@@ -95,11 +95,6 @@ class DrivenCar:
     car brakes for road users that are in its way now or soon, and they brake for the car; if both have stood for
     `PATIENCE_S`, the others give way, see `RoadUsers`.
 
-    Args:
-        scenario: the scenario, with lot, parked cars and traffic.
-        vehicle: its size and limits.
-        style: driving style.
-
     Attributes:
         log: record of the drive since `begin`.
         state: (6,) state of the vehicle, see `parkenv.driving.vehicle`.

@@ -69,19 +69,10 @@ class _MotionRecorder(Observer):
 
 
 def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0) -> Parking:
-    """Run one parking episode.
+    """Run one episode of `parkenv/Drive-v1`; with frames, `every` so many steps, of `render_mode="rgb_array"`.
 
-    Args:
-        env: `parkenv/Drive-v1`; with `render_mode="rgb_array"` for pictures.
-        agent: the parking agent.
-        seed: seed of the task.
-        every: steps between frames; 0 for none.
-
-    Returns:
-        A row with lot, seed, kind, way, slot, parked, reason (of a failure), contact (what was touched), time_s,
-        driven_m, direction_changes, wheel_rad and turned_rad (total change of steering angle and heading),
-        position_error_m, angle_error_deg; for a planner also plans, planning_s (all plans), path_m, expansions,
-        margin_m.
+    In its row, `contact` is what was touched, `wheel_rad` and `turned_rad` are total changes of steering angle and
+    heading, and `planning_s` is that of all plans.
     """
     recorder = _MotionRecorder()
     film = [FrameRecorder(every)] if every else []
@@ -132,12 +123,7 @@ def _park_some(case: ParkingCase, seeds: Sequence[int]) -> list[Parking]:
 
 
 def parking_table(rows: Sequence[Row]) -> list[Row]:
-    """Summarise parkings: one row per kind of slot and way of parking, and one for all (`kind` "all").
-
-    Returns:
-        kind, way, episodes, parked, success and its 95 % interval (Wilson), contacts; median and p95 of planning_ms
-        (the first plan), time_s and direction_changes; means of driven_m, wheel_rad, turned_rad.
-    """
+    """Summarise parkings: one row per kind of slot and way of parking, and one for all (`kind` "all")."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["kind"], row["way"]), []).append(row)
@@ -177,11 +163,7 @@ def park_on_lots(
     workers: Workers = SERIAL,
     progress: Progress = lambda *_: None,
 ) -> tuple[list[Row], list[Row]]:
-    """Park with all seeds on all lots; write episodes.csv, pictures and a film into a folder.
-
-    Returns:
-        A row for each episode, and the `parking_table`.
-    """
+    """Park with all seeds on all lots; write episodes.csv and pictures; return its rows and the `parking_table`."""
     for case in cases:
         case.environment().close()
     total, parkings = len(cases) * len(seeds), list[Parking]()

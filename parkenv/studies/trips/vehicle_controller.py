@@ -58,15 +58,7 @@ class VehicleController:
 
     Paths along lanes are straights and arcs. Paths between lanes are planned as if all slots were taken, so they can be
     driven at any time. Parking, turning round and leaving a slot are planned among the cars that are parked there. Cars
-    that arrive during a manoeuvre wait until it is over.
-
-    Args:
-        scenario: the scenario, with lot, parked cars and traffic.
-        vehicle: the car.
-        style: driving style.
-
-    Attributes:
-        car: the car that is driven, with its state, log and track.
+    that arrive during a manoeuvre wait until it is over. `car` has the state, log and track of what is driven.
     """
 
     def __init__(
@@ -120,9 +112,7 @@ class VehicleController:
     def park(self, slot: int, taken: bool) -> ParkingAttempt:
         """Stop, plan a manoeuvre into a slot and drive it; if it is taken or too narrow, return to the lane.
 
-        Args:
-            slot: index of the slot.
-            taken: whether a car is parked in the slot; this car notices it when it is about to drive in.
+        The car notices that the slot is `taken` when it is about to drive in.
         """
         lot, vehicle, began = self.scenario.lot, self.vehicle, self.car.time
         self.car.track = []
