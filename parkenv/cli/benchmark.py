@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from parkenv.cli.options import Command
-from parkenv.cli.tables import command_line, make_console, print_rows, print_table
+from parkenv.cli.tables import command_line, print_rows, print_table
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.known_names import SuiteName
 from parkenv.files.option import option
@@ -28,11 +28,10 @@ class Check(Command):
     def run(self) -> None:
         from parkenv.studies.benchmark.suite import check_result
 
-        console = make_console()
-        with console.status("Checking"):
+        with self.console.status("Checking"):
             checked = [check_result(file) for file in self.results]
-        print_table(console, score_table(checked))
-        console.print(f"{'Complete and consistent' if len(checked) == 1 else 'All complete and consistent'}.")
+        print_table(self.console, score_table(checked))
+        self.say(f"{'Complete and consistent' if len(checked) == 1 else 'All complete and consistent'}.")
 
 
 class Page(Command):
@@ -62,12 +61,11 @@ class Page(Command):
 
         files = [file for path in self.results for file in result_files(path)]
         make_folder(self.out.parent)
-        console = make_console()
-        with console.status("Checking"):
+        with self.console.status("Checking"):
             checked = [check_result(file) for file in files]
         write_page(benchmark_data(checked, command_line()), self.out)
         agents = sum(len(result["scores"]) for result in checked)
-        console.print(f"Written: {self.out}, {plural(agents, 'agent')} in {plural(len(checked), 'result')}")
+        self.say(f"Written: {self.out}, {plural(agents, 'agent')} in {plural(len(checked), 'result')}")
 
 
 class Show(Command):
@@ -81,8 +79,7 @@ class Show(Command):
         from parkenv.studies.benchmark.suite import Suite
 
         suite = Suite.packaged(self.suite)
-        console = make_console()
-        console.print(f"{suite.name}: {suite.description}")
+        self.say(f"{suite.name}: {suite.description}")
         rows = []
         for task in suite.tasks:
             scenario, level = task.made(suite.arrival), task.occupancy_level
@@ -100,13 +97,13 @@ class Show(Command):
                 }
             )
         print_rows(
-            console,
+            self.console,
             "Tasks",
             rows,
             columns=(Column("task", "task"), *shared("scenario"), Column("slots", "slots")),
         )
         counts = [len(task.seeds) for task in suite.tasks]
-        console.print(
+        self.say(
             f"{min(counts)} to {max(counts)} episodes a task, {sum(counts):,} in all, weighted by stratum; "
             f"suite {suite.fingerprint[:16]}"
         )

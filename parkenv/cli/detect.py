@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from parkenv.cli.options import Command
-from parkenv.cli.tables import make_console, print_rows, save_summary, stages
+from parkenv.cli.tables import print_rows, save_summary, stages
 from parkenv.errors import require
 from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import option
@@ -86,22 +86,21 @@ class Detect(Command):
     def run(self) -> None:
         from parkenv.studies.sensing.detection_run import find_cars
 
-        console = make_console()
-        with stages(console, "frames") as progress:
+        with stages(self.console, "frames") as progress:
             cars = find_cars(
                 self.images, self._on_ground(self._finder()), self.threshold, self.step, self.out, progress
             )
         boxes = [box for box in cars.boxes if box["frame"] is None]
         if cars.images:
-            print_rows(console, "Cars", boxes, [column.key for column in BOX], BOX)
-            console.print(f"{plural(len(boxes), 'car')} in {plural(cars.images, 'image')}")
+            print_rows(self.console, "Cars", boxes, [column.key for column in BOX], BOX)
+            self.say(f"{plural(len(boxes), 'car')} in {plural(cars.images, 'image')}")
         for video in cars.videos:
-            console.print(
+            self.say(
                 f"{video['file']}: {plural(video['frames'], 'frame')} of {video['seconds']:.1f} s, "
                 f"{plural(video['boxes'], 'box', 'boxes')}, at most {plural(video['most_cars'], 'car')} in a frame"
             )
         for topic in cars.not_searched:
-            console.print(f"Not searched: {topic['file']}: {topic['reason']}")
+            self.say(f"Not searched: {topic['file']}: {topic['reason']}")
         if self.out is not None:
             file, *sides, probability, view, visible = (column.key for column in BOX)
             rows = [
@@ -110,7 +109,7 @@ class Detect(Command):
                 for box in boxes
             ]
             save_summary(self.out, None, rows, videos=cars.videos, not_searched=cars.not_searched)
-            console.print(f"Pictures, films, boxes.csv and summary.json are in {self.out}")
+            self.say(f"Pictures, films, boxes.csv and summary.json are in {self.out}")
 
     def _on_ground(self, detector: Detector) -> Detector:
         if self.calibration is None:
@@ -201,8 +200,7 @@ class TrainDetector(Command):
         require(self.out.suffix == ".npz", f"--out {self.out}: want a name that ends in .npz")
         check_writable(self.out)
         window = END if self.front else SIDE
-        console = make_console()
-        with console.status("Training") as status:
+        with self.console.status("Training") as status:
             data, photos = self._photographs()
             aligned: dict[str, Any] = (
                 {} if self.labels is None else {"region_aspect": window.aspect, "car": window.car}
@@ -222,7 +220,7 @@ class TrainDetector(Command):
                 **aligned,
             )
             model.save(self.out)
-        console.print(f"Trained on {model.trained_on}. Written: {self.out}")
+        self.say(f"Trained on {model.trained_on}. Written: {self.out}")
 
     def _photographs(self) -> tuple[Crops, Sequence[LabelledImage]]:
         from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
@@ -282,11 +280,11 @@ class EvaluateDetector(Command):
         from parkenv.perception.car_datasets import read_crop_folder
         from parkenv.perception.detection_scores import recall_on_crops, score_on_uiuc
 
-        detector, console = self._detector(), make_console()
+        detector = self._detector()
         if self.crops is not None:
             crops = read_crop_folder(self.crops)
             make_folder(self.out)
-            with stages(console, "crops") as progress:
+            with stages(self.console, "crops") as progress:
                 advance = counted(progress, "Detecting", len(crops.positives) + len(crops.negatives))
                 rows = recall_on_crops(detector, crops, on_image=advance)
             columns = [
@@ -296,7 +294,7 @@ class EvaluateDetector(Command):
                 r | {"recall_ci95": [r["recall"] - r["interval"], r["recall"] + r["interval"]]} for r in rows
             ]
             print_rows(
-                console,
+                self.console,
                 "Cars found in crops",
                 shown,
                 ("false_positives", "recall", "cars", "others"),
@@ -304,11 +302,11 @@ class EvaluateDetector(Command):
             )
         elif self.uiuc is not None:
             make_folder(self.out)
-            with stages(console, "images") as progress:
+            with stages(self.console, "images") as progress:
                 rows = score_on_uiuc(detector, self.uiuc, on_image=counted(progress, "Detecting"))
-            print_rows(console, "UIUC", rows)
+            print_rows(self.console, "UIUC", rows)
         save_summary(self.out, None, rows)
-        console.print(f"Written: {self.out / 'summary.json'}")
+        self.say(f"Written: {self.out / 'summary.json'}")
 
     def _detector(self) -> CarModel | Detector:
         from parkenv.perception.car_model import PACKAGED_MODELS, CarModel

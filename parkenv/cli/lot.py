@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from textwrap import shorten
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -69,6 +69,7 @@ Place = Annotated[
 class Show(Command):
     """Slots are coloured by their zone or parking cost. The output lists the guesses of an import."""
 
+    soft_wrap: ClassVar = True
     examples = """
         parkenv lot show campus --graph --out campus.png
         parkenv lot show mine.geojson
@@ -88,9 +89,8 @@ class Show(Command):
         picture = self.out or Path(file_name(lot.name, ".png"))
         guesses = origin.guesses if origin is not None else ()
         save_lot_picture(lot, picture, show_graph=self.graph, guesses=guesses)
-        console = make_console(soft_wrap=True)
-        _print_each(console, "guessed", guesses, "cyan")
-        console.print(f"{_summary(lot)}. Picture: {picture}")
+        _print_each(self.console, "guessed", guesses, "cyan")
+        self.say(f"{_summary(lot)}. Picture: {picture}")
 
 
 class Check(Command):
@@ -102,6 +102,7 @@ class Check(Command):
     The exit code is 2 if there are errors, else 0. For a file to import, the command lists what an import would lack.
     """
 
+    soft_wrap: ClassVar = True
     examples = """
         parkenv lot check mine.geojson
         parkenv lot check map.osm
@@ -114,7 +115,6 @@ class Check(Command):
         from parkenv.lots.lot_files import WHOLE, lot_format
         from parkenv.studies.lots import check_drivability
 
-        console = make_console(soft_wrap=True)
         problems, form, drivability = check_lot(self.place), lot_format(self.place), None
         if form in WHOLE and not any(p.severity == "error" for p in problems):
             origin = _provenance(self.place)
@@ -126,16 +126,16 @@ class Check(Command):
         for problem in problems:
             feature = "" if problem.feature is None else f"feature {problem.feature}: "
             style = "red" if problem.severity == "error" else "yellow"
-            _print_each(console, problem.severity, [f"{feature}{problem.message}"], style)
+            _print_each(self.console, problem.severity, [f"{feature}{problem.message}"], style)
         errors = sum(p.severity == "error" for p in problems)
         counts = f"{plural(errors, 'error')}, {plural(len(problems) - errors, 'warning')}"
-        console.print(f"{self.place}: {counts if problems else 'no errors, no warnings'}")
+        self.say(f"{self.place}: {counts if problems else 'no errors, no warnings'}")
         if errors:
             raise Exit(2)
         if drivability is not None:
-            console.print(_summary(lot))
+            self.say(_summary(lot))
             reasons = f": {'; '.join(map(str, drivability.issues))}" if drivability.issues else ""
-            console.print(f"error probability {drivability.error_probability:.2f}{reasons}")
+            self.say(f"error probability {drivability.error_probability:.2f}{reasons}")
 
 
 def _points(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
@@ -179,6 +179,7 @@ class Import(Command):
     If something is missing, the picture is still drawn, but no lot is written and the exit code is 2.
     """
 
+    soft_wrap: ClassVar = True
     examples = """
         parkenv lot import map.osm --out lot.geojson --picture lot.png
         parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25
@@ -336,7 +337,6 @@ class Import(Command):
                     file.resolve() not in inputs, f"--out {self.out}: would replace {file}, which is read"
                 )
                 check_writable(file)
-        console = make_console(soft_wrap=True)
         if self._is_town:
             town = import_town(
                 self.place, self.car_parks, bays=self.bays, columns=self.columns, bays_only=not self.town,
@@ -346,10 +346,12 @@ class Import(Command):
         draft = town.draft if town is not None else import_lot(self.place, self._options)
         draft = draft.in_left_hand_traffic() if self.left_hand else draft
         for line in draft.found:
-            console.print(line)
-        _print_each(console, "guessed", draft.guesses, "cyan")
+            self.say(line)
+        _print_each(self.console, "guessed", draft.guesses, "cyan")
         bays_out = () if town is None else town.bays_left_out
-        _print_each(console, "left out", [left for left in draft.left_out if left not in bays_out], "yellow")
+        _print_each(
+            self.console, "left out", [left for left in draft.left_out if left not in bays_out], "yellow"
+        )
         if self.picture is not None:
             from parkenv.show.figures.lots import save_import_picture, save_town_picture
 
@@ -357,7 +359,7 @@ class Import(Command):
                 save_town_picture(town, self.picture)
             else:
                 save_import_picture(draft, self.picture)
-            console.print(f"Picture: {self.picture}")
+            self.say(f"Picture: {self.picture}")
         try:
             lot = draft.lot()
         except InputError as error:
@@ -367,7 +369,7 @@ class Import(Command):
         write_lot(lot, self.out, provenance if draft.guesses else None)
         if town is not None:
             write_csv(table, TABLE, town.facilities)
-            console.print(f"Facilities: {table}")
+            self.say(f"Facilities: {table}")
         if self.bays is not None:
             write_csv(
                 left_out_csv,
@@ -375,33 +377,30 @@ class Import(Command):
                 [{"reason": left.reason, "id": name} for left in bays_out for name in left.ids],
             )
             rows = [{"reason": left.reason, "bays": len(left.ids), "ids": left.shown} for left in bays_out]
-            print_rows(console, f"Bays left out, all in {left_out_csv}", rows, columns=_LEFT_OUT)
+            print_rows(self.console, f"Bays left out, all in {left_out_csv}", rows, columns=_LEFT_OUT)
         if draft.unread or unread_csv.exists():
             write_csv(unread_csv, [field.name for field in fields(Unread)], map(vars, draft.unread))
-            console.print(
+            self.say(
                 f"Tags that could not be read, and what was assumed: {len(draft.unread)}, all in {unread_csv}"
             )
             for row in sorted(draft.unread, key=lambda row: -row.count)[:_MOST_UNREAD]:
                 text = shorten(f"{row.tag}={row.value}", 60, placeholder="...")
-                console.print(f"{row.count:5} {text}: {row.assumed}", highlight=False, markup=False)
-        console.print(f"Wrote {self.out}. {_summary(lot)}")
+                self.say(f"{row.count:5} {text}: {row.assumed}", highlight=False, markup=False)
+        self.say(f"Wrote {self.out}. {_summary(lot)}")
         if caution:
-            console.print(caution, style="yellow")
+            self.say(caution, style="yellow")
 
     def _import_car_parks(self) -> None:
         from parkenv.studies.lots import import_town_lots
 
-        console = make_console(soft_wrap=True)
-        with stages(console) as progress, write_together(self.out) as folder:
+        with stages(self.console) as progress, write_together(self.out) as folder:
             rows = import_town_lots(self.place, folder, self._options, self.least, progress)
             save_summary(folder, None, rows)
         print_rows(make_console(), "Car parks", rows, columns=_LOT_COLUMNS)
         results = Counter(row["result"] for row in rows)
         listed = ", ".join(f"{results[name]} {name}" for name in ("clean", "warnings", "refused"))
         lots = plural(len(rows) - results["refused"], "lot")
-        console.print(
-            f"{plural(len(rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}"
-        )
+        self.say(f"{plural(len(rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}")
 
 
 class Census(Command):
@@ -414,6 +413,7 @@ class Census(Command):
     The exit code is 2 if a file holds no lot; the others are counted nevertheless.
     """
 
+    soft_wrap: ClassVar = True
     examples = """
         parkenv lot import town.geojson --split --out lots
         parkenv lot census lots
@@ -432,7 +432,7 @@ class Census(Command):
     def run(self) -> None:
         from parkenv.studies.lots import take_census
 
-        with stages(make_console(soft_wrap=True), "lots") as progress:
+        with stages(self.console, "lots") as progress:
             rows = take_census(self.places, self.out, progress=progress)
         save_summary(self.out, None, rows)
         print_rows(make_console(), "Lots", rows, [column.key for column in _LOT_COLUMNS], _LOT_COLUMNS)
@@ -440,7 +440,7 @@ class Census(Command):
         listed = ", ".join(
             f"{results[name]} {name}" for name in ("clean", "warnings", "invalid") if results[name]
         )
-        make_console(soft_wrap=True).print(
+        self.say(
             f"{plural(len(rows), 'lot')}, {slots:,} slots: {listed}. Table and pictures are in {self.out}"
         )
         if results["invalid"]:
@@ -459,7 +459,7 @@ class Convert(Command):
         from parkenv.lots import load_lot, write_lot
 
         write_lot(load_lot(self.lot), self.out)
-        make_console().print(f"Wrote {self.out}")
+        self.say(f"Wrote {self.out}")
 
 
 def _print_each(console: Console, what: str, texts: Iterable[object], style: str) -> None:

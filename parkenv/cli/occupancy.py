@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from parkenv.cli.options import Command
-from parkenv.cli.tables import make_console, print_rows, save_summary, stages
+from parkenv.cli.tables import print_rows, save_summary, stages
 from parkenv.files.atomic_write import check_writable, make_folder
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
@@ -95,12 +95,11 @@ class Fit(Command):
         from parkenv.studies.occupancy import fit
         from parkenv.world.occupancy.log import RecordedFile
 
-        console = make_console()
-        with stages(console) as progress:
+        with stages(self.console) as progress:
             make_folder(self.out)
             recorded = RecordedFile((self.log,), self.timezone, self.capacity, self.columns)
             report = fit(recorded, self.out, max_gap_s=3600.0 * self.max_gap_h, progress=progress)
-        _show(console, report, self.out, None, COLUMNS)
+        _show(self.console, report, self.out, None, COLUMNS)
 
 
 class Evaluate(Command):
@@ -134,8 +133,7 @@ class Evaluate(Command):
         from parkenv.studies.occupancy import evaluate
         from parkenv.world.occupancy.log import RecordedFile
 
-        console = make_console()
-        with stages(console) as progress:
+        with stages(self.console) as progress:
             make_folder(self.out)
             report = evaluate(
                 RecordedFile((self.log,), self.timezone, self.capacity, self.columns),
@@ -145,7 +143,9 @@ class Evaluate(Command):
                 seed=self.seed,
                 progress=progress,
             )
-        _show(console, report, self.out, self.seed, SCORE_COLUMNS, [column.key for column in SCORE_COLUMNS])
+        _show(
+            self.console, report, self.out, self.seed, SCORE_COLUMNS, [column.key for column in SCORE_COLUMNS]
+        )
 
 
 class Record(Command):
@@ -175,13 +175,12 @@ class Record(Command):
         from parkenv.studies.fleet.drivers import record_days
 
         check_writable(self.out)
-        console = make_console()
-        with stages(console) as progress:
+        with stages(self.console) as progress:
             lines = record_days(
                 self.scenario, self.out, agent=self.agent, days=self.days, rounds=self.rounds, seed=self.seed,
                 progress=progress,
             )  # fmt: skip
-        console.print(f"{self.out}: {lines:,} observations of {plural(self.days, 'day')}", soft_wrap=True)
+        self.say(f"{self.out}: {lines:,} observations of {plural(self.days, 'day')}", soft_wrap=True)
 
 
 def _show(

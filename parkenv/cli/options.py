@@ -7,17 +7,32 @@ import types
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from importlib import import_module
 from keyword import iskeyword
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, Union, get_args, get_origin
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Self,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+)
 
 from pydantic.fields import FieldInfo
 
+from parkenv.cli.tables import make_console
 from parkenv.errors import InputError, require
 from parkenv.files.option import Inside, Option
 from parkenv.files.spec_file import Spec, models_in
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 SpecT = TypeVar("SpecT", bound=Spec)
 _LETTERS = {int: "N", float: "X", Path: "FILE"}
@@ -31,10 +46,18 @@ class Command(Spec):
     """A command: its fields are its arguments and options; its docstring and examples are on its help page."""
 
     examples: ClassVar[str]
+    soft_wrap: ClassVar[bool] = False  # whether lines are printed whole, however wide the terminal is
 
     @classmethod
     def of(cls, given: Given) -> Self:
         return spec_of(cls, given)
+
+    @cached_property
+    def console(self) -> Console:
+        return make_console(soft_wrap=self.soft_wrap)
+
+    def say(self, text: str, **how: Any) -> None:
+        self.console.print(text, **how)
 
     @abstractmethod
     def run(self) -> None:

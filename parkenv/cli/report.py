@@ -137,12 +137,11 @@ class Play(Command):
         from parkenv.show.report.page import write_game
         from parkenv.studies.play import game_data
 
-        console = make_console()
-        with stages(console) as progress:
+        with stages(self.console) as progress:
             seeds = range(self.seed, self.seed + self.worlds)
             data = game_data(build(self.scenario), self.agents, seeds, progress)
         make_folder(self.out.parent)
         write_game(data, self.out)
-        console.print(f"Written: {self.out}, {self.out.stat().st_size / 1e6:.1f} MB")
+        self.say(f"Written: {self.out}, {self.out.stat().st_size / 1e6:.1f} MB")
         if not (self.html or webbrowser.open(self.out.absolute().as_uri())):
-            console.print("No browser can be opened here: open the page in one.")
+            self.say("No browser can be opened here: open the page in one.")

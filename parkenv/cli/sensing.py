@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 from pydantic.fields import FieldInfo
 
 from parkenv.cli.options import Command
-from parkenv.cli.tables import make_console, print_rows, print_table, save_summary, stages
+from parkenv.cli.tables import print_rows, print_table, save_summary, stages
 from parkenv.errors import InputError, nearest, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
@@ -97,8 +97,7 @@ class MapDrive(Command):
         require(self.discover or self.streets is None, "--streets is of --discover")
         require(self.discover or len(self.recordings) == 1, "several recordings are of --discover, want one")
         scenario = None if self.scenario is None else build(self.scenario)
-        console = make_console()
-        with stages(console, "captures") as progress:
+        with stages(self.console, "captures") as progress:
             reader = DriveReader(
                 make_detector(self.detector or (scenario.detector if scenario else "hog")),
                 None if self.calibration is None else DriveCalibration.read(self.calibration),
@@ -114,11 +113,11 @@ class MapDrive(Command):
                 rows = [add_recording(self.recordings[0], scenario, self.out, reader, lot_file=lot_file)]
         save_summary(self.out, None, rows)
         for row in rows:
-            print_table(console, table_of("", "The drive", [row], COLUMNS, facts=True))
-            self._warn(console, row, scenario)
+            print_table(self.console, table_of("", "The drive", [row], COLUMNS, facts=True))
+            self._warn(self.console, row, scenario)
         lot = "lot.geojson, " if self.discover else ""
         written = "map.png, map.yaml, slots.geojson, slots.png, cars.csv, sightings.csv, summary.json"
-        console.print(f"Written: {self.out / 'map.sqlite'}, {lot}{written}")
+        self.say(f"Written: {self.out / 'map.sqlite'}, {lot}{written}")
 
     def _warn(self, console: Console, row: Row, scenario: Scenario | None) -> None:
         driven_in = row["key"].partition("/")[0]
@@ -181,17 +180,16 @@ class Map(Command):
             for i, name in enumerate(ids)
             if slot in (None, name)
         ]
-        console = make_console()
         free = sorted(rows, key=lambda row: float(str(row["p_occupied"])))[:MOST_ROWS]
-        print_rows(console, f"{scenario.name}, {when}, {plural(len(log.time), 'session')}", free)
+        print_rows(self.console, f"{scenario.name}, {when}, {plural(len(log.time), 'session')}", free)
         if len(rows) > MOST_ROWS:
-            console.print(f"The {MOST_ROWS} most likely free of {len(rows)}; --out writes all.")
+            self.say(f"The {MOST_ROWS} most likely free of {len(rows)}; --out writes all.")
         if self.out is not None:
             make_folder(self.out)
             save_map(lot, predicted, None, f"{scenario.name}, {when}", self.out / "map.png")
             write_csv(self.out / "slots.csv", list(rows[0]), rows)
             save_summary(self.out, None, rows)
-            console.print(f"Written: {self.out / 'map.png'}, slots.csv, summary.json")
+            self.say(f"Written: {self.out / 'map.png'}, slots.csv, summary.json")
 
 
 UP_TO = Column("up_to", "slots up to", "m")
@@ -227,13 +225,10 @@ class Preview(Command):
         from parkenv.scenarios.build import build
         from parkenv.studies.sensing.simulated_sensors import preview_sensors
 
-        console = make_console()
-        console.print(
-            "The first image after an installation waits about 20 s for the renderer to be compiled."
-        )
-        with stages(console) as progress:
+        self.say("The first image after an installation waits about 20 s for the renderer to be compiled.")
+        with stages(self.console) as progress:
             preview_sensors(build(self.scenario), self.out, self.weather, seed=self.seed, progress=progress)
-        console.print(f"Images are in {self.out}")
+        self.say(f"Images are in {self.out}")
 
 
 class FitSensorModel(Command, ExecutionSpec):
@@ -271,8 +266,7 @@ class FitSensorModel(Command, ExecutionSpec):
         specs = [with_traffic(spec) for spec in self.scenarios]
         scenarios, rig = [build(spec) for spec in specs], self.rig or specs[0].rig
         make_folder(self.out.parent)
-        console = make_console()
-        with self.workers() as workers, stages(console, "episodes") as progress:
+        with self.workers() as workers, stages(self.console, "episodes") as progress:
             total = self.episodes * len(AGENTS) * len(scenarios)
             counts = measure_sensors(
                 scenarios,
@@ -288,5 +282,5 @@ class FitSensorModel(Command, ExecutionSpec):
         model.to_file(self.out)
         in_range = counts.reshape(-1, 2, 3).sum(axis=(1, 2)).tolist()
         rows = [{**asdict(band), "slots_in_range": n} for band, n in zip(model.bands, in_range, strict=True)]
-        print_rows(console, f"Observations of slots, rig {rig}", rows, columns=(UP_TO,))
-        console.print(f"Written: {self.out}")
+        print_rows(self.console, f"Observations of slots, rig {rig}", rows, columns=(UP_TO,))
+        self.say(f"Written: {self.out}")

@@ -11,7 +11,7 @@ from typer import echo
 
 from parkenv.cli.options import Command, Given, command_class, field_options, spec_of
 from parkenv.cli.report import Trust, make_report, require_trust
-from parkenv.cli.tables import command_line, make_console, print_table, stages
+from parkenv.cli.tables import command_line, print_table, stages
 from parkenv.errors import nearest, require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.option import Option, option
@@ -20,8 +20,6 @@ from parkenv.studies.runner import Interrupted, run
 from parkenv.studies.study import STUDIES, ExecutionSpec, Study, read_study, schemas, study_class
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from parkenv.studies.runner import Result
 
 # Commands of studies that have options besides the fields of the study, in `parkenv.cli.study_commands`.
@@ -74,21 +72,21 @@ class StudyCommand(RunCommand):
         self.run_study()
 
     def run_study(self) -> Result:
-        console, out = make_console(), self.out or self.study.folder({})
+        out = self.out or self.study.folder({})
         try:
-            with stages(console, self.study.unit) as progress:
+            with stages(self.console, self.study.unit) as progress:
                 result = run(
                     self.study, out, resume=self.resume, overwrite=self.overwrite, progress=progress,
                     command=command_line(),
                 )  # fmt: skip
         except KeyboardInterrupt as stopped:
             if isinstance(stopped, Interrupted):
-                self.show(console, stopped.result)
+                self.show(stopped.result)
             rest = f" What was finished is in {out}; parkenv run {out} --resume goes on."
-            console.print(f"Interrupted.{rest if (out / SPEC_FILE).exists() else ''}", soft_wrap=True)
+            self.say(f"Interrupted.{rest if (out / SPEC_FILE).exists() else ''}", soft_wrap=True)
             raise
-        self.show(console, result)
-        console.print(f"Results are in {out}")
+        self.show(result)
+        self.say(f"Results are in {out}")
         if self.report:
             self.write_report(result)
         return result
@@ -96,13 +94,13 @@ class StudyCommand(RunCommand):
     def write_report(self, result: Result) -> Path:
         return make_report(result.folder, self.study)
 
-    def show(self, console: Console, result: Result) -> None:
+    def show(self, result: Result) -> None:
         if result.rows:
             summary = without_nan(result.summary)
             for table in self.study.printed(summary, result.folder):
-                print_table(console, table)
+                print_table(self.console, table)
             for line in self.study.findings(summary) if result.complete else ():
-                console.print(line, soft_wrap=True)
+                self.say(line, soft_wrap=True)
 
 
 def study_command(kind: str) -> type[StudyCommand]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
 from parkenv.cli.options import Command, Given
 from parkenv.cli.report import make_report
 from parkenv.cli.study_command import StudyCommand
-from parkenv.cli.tables import make_console, print_rows, save_summary, stages
+from parkenv.cli.tables import print_rows, save_summary, stages
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.field_types import Probability
 from parkenv.files.folder_lock import only_writer
@@ -64,12 +64,12 @@ class Survey(StudyCommand):
 
         require_recordable(self.record)
         self.run_study()
-        console, study = make_console(), self.study
+        study = self.study
         assert isinstance(study, SurveyStudy)
-        with console.status(f"Driving the first session once more for {self.record}"):
+        with self.console.status(f"Driving the first session once more for {self.record}"):
             record_drive(study.survey, 0, self.record)
         again = f"parkenv map-drive {self.record} --scenario {study.scenario.argument}"
-        console.print(f"Recorded: {self.record}; map it with: {again}")
+        self.say(f"Recorded: {self.record}; map it with: {again}")
 
 
 NEXT = (
@@ -82,6 +82,7 @@ NEXT = (
 
 
 class Demo(StudyCommand):
+    soft_wrap: ClassVar = True
     quick: bool = option(
         False,
         "A shorter demo: fewer drives and episodes, captures farther apart.",
@@ -91,13 +92,12 @@ class Demo(StudyCommand):
 
     def run(self) -> None:
         out = self.run_study().folder
-        console = make_console(soft_wrap=True)
-        console.print("\nOpen")
+        self.say("\nOpen")
         if self.report:
-            console.print(f"  {out / PAGE}\n    the results on one page, with replays, in a browser")
-        console.print(f"  {out / FILM}\n    a film of one search\n\nTry next")
+            self.say(f"  {out / PAGE}\n    the results on one page, with replays, in a browser")
+        self.say(f"  {out / FILM}\n    a film of one search\n\nTry next")
         for command, explained in NEXT:
-            console.print(f"  {command}\n    {explained}")
+            self.say(f"  {command}\n    {explained}")
 
     def write_report(self, result: Result) -> Path:
         shown = result.results.kept.get(SHOWN)
@@ -162,19 +162,16 @@ class Park(StudyCommand):
             for spec in self.scenarios
         ]
         seeds = range(study.seed, study.seed + study.episodes)
-        console = make_console()
         with only_writer(out):
-            with stages(console, "episodes") as progress, study.workers() as workers:
+            with stages(self.console, "episodes") as progress, study.workers() as workers:
                 rows, table = park_on_lots(cases, seeds, out, workers=workers, progress=progress)
             names = [case.lot.name for case in cases]
             save_summary(out, study.seed, table, lots=names, agents={PLANNER: PLANNER})
         title = f"{', '.join(names)}, {plural(study.episodes, 'episode')} per lot"
-        print_rows(console, title, table, SHOWN_OF_PARKINGS, study.columns)
+        print_rows(self.console, title, table, SHOWN_OF_PARKINGS, study.columns)
         for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
-            console.print(
-                f"failed: {row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
-            )
-        console.print(f"Episodes, summary and pictures are in {out}")
+            self.say(f"failed: {row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}")
+        self.say(f"Episodes, summary and pictures are in {out}")
 
 
 class Plan(Command):
@@ -203,9 +200,8 @@ class Plan(Command):
         from parkenv.show.figures.searches import draw_searches
         from parkenv.studies.compare.cases import plan_searches, settings_of
 
-        console = make_console()
         grid = self.grid
-        with console.status("Planning"):
+        with self.console.status("Planning"):
             settings = settings_of(build(self.scenario), grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh)
             rows, searches = plan_searches(settings, self.agent, self.seed)
             make_folder(self.out)
@@ -213,9 +209,9 @@ class Plan(Command):
         save_summary(self.out, self.seed, rows)
         title = f"{self.scenario.title}: plans of {self.agent.label}, seed {self.seed}"
         print_rows(
-            console,
+            self.console,
             title,
             rows,
             (*SETTING_AXES, "slot", "expected_s", "total_s", "driven_m", "walked_m", "replans"),
         )
-        console.print(f"Picture and summary are in {self.out}")
+        self.say(f"Picture and summary are in {self.out}")
