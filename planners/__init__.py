@@ -3,8 +3,6 @@
 They know the lot and the belief. Only the oracle knows the hidden occupancy. Each name is loaded on first use.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

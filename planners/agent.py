@@ -1,7 +1,5 @@
 """The interface of agents, and a factory that makes agents by name."""
 
-from __future__ import annotations
-
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence

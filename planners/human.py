@@ -1,7 +1,5 @@
 """A person's searches in a game of `parkenv play`, repeated by an agent."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Annotated
 

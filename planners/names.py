@@ -1,7 +1,5 @@
 """Names of the agents that come with the package and of learning algorithms, without the modules behind them."""
 
-from __future__ import annotations
-
 EXPECTS_RIVALS = "belief-rivals"  # the agent with the option `arrivals_per_hour`: rivals an hour
 # Module and class of each agent; modules are imported when an agent is made.
 AGENTS: dict[str, tuple[str, str]] = {

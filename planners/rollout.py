@@ -3,8 +3,6 @@
 It is what a planner on `parkenv.model` looks like: it asks the model alone.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from abc import abstractmethod

@@ -1,7 +1,5 @@
 """Shortest drives: searched only as far as needed, and a table of all in a lot or a part of it."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Iterator
 from typing import Any, Self

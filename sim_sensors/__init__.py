@@ -4,8 +4,6 @@ The package contains geometry and light, but nothing about parking. Each name is
 `sim_sensors.laser` does not load the cameras.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

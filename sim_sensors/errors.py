@@ -1,7 +1,5 @@
 """Errors of the simulated sensors, and the checks that raise them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ground truth of the vehicles in a frame: bounding boxes, visible fractions, and viewing sides."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum

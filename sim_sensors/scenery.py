@@ -1,7 +1,5 @@
 """Meshes of scenery: buildings, walls, hedges, trees, pedestrians."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import NamedTuple
 

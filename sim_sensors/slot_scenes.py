@@ -1,7 +1,5 @@
 """Scenes of parking slots and their occupancy: vehicle models and parking poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache

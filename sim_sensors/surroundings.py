@@ -1,7 +1,5 @@
 """The static surroundings of a scene, from plain arrays: the ground and scenery."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -8,8 +8,6 @@ decay κ = λ + μ of the slot itself (`slot_belief`), P(free) is above what it 
     ν·excess·(exp(-κt) - exp(-νt)) / (ν - κ).
 """
 
-from __future__ import annotations
-
 import math
 
 from parkenv.compiled.jit import compiled

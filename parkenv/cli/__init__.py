@@ -1,7 +1,5 @@
 """The command line; `parkenv COMMAND --help` explains each command."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os

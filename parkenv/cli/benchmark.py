@@ -1,7 +1,5 @@
 """`parkenv benchmark`: a fixed suite with comparable, checkable results."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from parkenv.cli.options import Command

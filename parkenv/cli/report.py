@@ -1,7 +1,5 @@
 """`parkenv report` and `play`: pages on a run and of a game; and the trust that running a file's code needs."""
 
-from __future__ import annotations
-
 import sys
 import webbrowser
 from collections.abc import Collection

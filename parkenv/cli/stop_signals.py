@@ -1,7 +1,5 @@
 """What SIGINT (Ctrl-C), SIGTERM and SIGHUP do to a command."""
 
-from __future__ import annotations
-
 import _thread
 import os
 import signal

@@ -1,7 +1,5 @@
 """The seconds that this process has spent on compiling functions and loading compiled code."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

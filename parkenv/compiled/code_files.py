@@ -4,8 +4,6 @@ A file is a pickle, and reading it can run code of its author. So only files tha
 administrator can have written are read, wherever `NUMBA_CACHE_DIR` is.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import itertools

@@ -1,7 +1,5 @@
 """A binary heap of whole numbers by key, for compiled searches over a graph and queues of events."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

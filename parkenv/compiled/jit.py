@@ -9,8 +9,6 @@ functions that Python calls (`_Library`): what only compiled code calls would be
 its callers, which takes longer than everything else.
 """
 
-from __future__ import annotations
-
 import functools
 import gc
 from collections.abc import Callable, Iterator

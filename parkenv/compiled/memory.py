@@ -4,8 +4,6 @@ A kernel that takes one record with the addresses of all its data compiles sever
 dozen arrays, and is cheap to call from Python. Code that writes an address into a record must keep the array alive.
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 from collections.abc import Sequence

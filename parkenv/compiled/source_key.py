@@ -5,8 +5,6 @@ calls or a constant that it reads, callers would keep running the old code. Here
 function's module and of every module that it imports, directly or indirectly. Of libraries only numba's version counts.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """One pool of threads for sensors and perception: pictures are drawn beside each other, and then looked at."""
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Collision detection with pymunk: parked cars, kerbs, walls, and moving road users."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum

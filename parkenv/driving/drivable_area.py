@@ -1,7 +1,5 @@
 """The paved area of a lot, its kerbs and walls, and the parked cars around one that drives through it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from itertools import pairwise
 

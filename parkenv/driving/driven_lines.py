@@ -1,7 +1,5 @@
 """The lines that cars follow on the lanes of a lot, and the positions of the drive graph's vertices on them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from functools import cached_property

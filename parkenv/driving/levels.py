@@ -5,8 +5,6 @@ parking scenarios" (2024): its margins, widths of aisles and amounts of clutter.
 across the aisle, and the level `moving`: normal, with pedestrians and cars that come through the aisle.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

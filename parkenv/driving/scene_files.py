@@ -3,8 +3,6 @@
 Files are recognised by their content. Coordinates of a scene are relative to its start, see `Scene.origin`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

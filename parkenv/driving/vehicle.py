@@ -1,7 +1,5 @@
 """The car: dimensions, limits, and the kinematic bicycle model."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Where the tables of many places do not fit the processor's inner caches, waiting
 So while one search is stepped with its local observation, the data of the next ones are loaded.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 

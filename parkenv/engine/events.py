@@ -18,8 +18,6 @@ arrival count as observations at its arrival, decayed to it; those that have los
 ignored. Which slot a guidance system has reserved for it, a car reads from its observation (`parkenv.engine.fleet`).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

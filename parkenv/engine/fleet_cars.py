@@ -1,7 +1,5 @@
 """The options of a fleet, its kinds of drivers, and the cars of its world, as its demand draws them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, Any

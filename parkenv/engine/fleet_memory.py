@@ -1,7 +1,5 @@
 """Memory of a fleet: the records that the compiled engine works on, and the observations of its cars."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@
 Functions named `..._at` take an address: that of a record of `Searches`, where they are called from Python.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

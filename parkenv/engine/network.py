@@ -1,7 +1,5 @@
 """A trained policy network as a compiled policy of a fleet."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial

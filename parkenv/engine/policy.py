@@ -5,8 +5,6 @@ Actions are those of `parkenv/Search-v2`, and `LEAVE` and `TAKE_SLOT + slot`. Th
 agent's observation holds: position, actions, the last observation of each slot.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -4,8 +4,6 @@ A field of the type `ADDRESS` holds the address of an array, whose shape and ele
 Times are in s since Monday 00:00.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

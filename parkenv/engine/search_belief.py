@@ -4,8 +4,6 @@ The cost of a step does not grow with the lot: only slots that a search has obse
 tables.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The spaces of a search: its observations and actions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from operator import index
 from typing import Any

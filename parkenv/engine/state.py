@@ -1,7 +1,5 @@
 """The full state of a search, for oracle policies, rendering and recording."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`parkenv/Drive-v1`: drive a car into a parking slot."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Observations and goals of `parkenv/Drive-v1`: space, own state, laser scene, obstacle map, errors of a goal."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

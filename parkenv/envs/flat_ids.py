@@ -9,8 +9,6 @@ search is in one of them. Gymnasium imports it where an id names it, so a learne
 (86,)
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gymnasium as gym

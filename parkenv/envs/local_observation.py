@@ -1,7 +1,5 @@
 """The wrapper that observes the car's surroundings, for policies that transfer between lots."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`parkenv/SearchPerception-v2`: the search with the real perception pipeline in the loop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Batches of environments as stable-baselines3's `VecEnv`."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from typing import Any
 

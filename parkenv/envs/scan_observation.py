@@ -17,8 +17,6 @@ away.
 | 35 + 77i to 106 + 77i | the shortest range in each of 72 equal sectors, from the right to the left |
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import Any

@@ -1,7 +1,5 @@
 """`parkenv/Search-v2`: search a parking lot for a free slot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from copy import deepcopy
 from functools import cache

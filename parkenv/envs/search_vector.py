@@ -1,7 +1,5 @@
 """Compiled batches of searches: the `vector_entry_point` of `parkenv/Search-v2`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial

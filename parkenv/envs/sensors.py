@@ -1,7 +1,5 @@
 """`parkenv/SearchSensors-v2`: the search with raw sensor data."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import Any
 

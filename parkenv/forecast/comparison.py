@@ -4,8 +4,6 @@ Each forecasts a day from the days before it. The simple ones state a fraction p
 earlier errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 

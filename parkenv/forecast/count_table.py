@@ -4,8 +4,6 @@ Columns are known by their English and German names, and separated by commas, se
 table that does not say whether its places are free or taken, or how many there are, is refused with all that it lacks.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence

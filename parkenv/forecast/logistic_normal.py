@@ -1,7 +1,5 @@
 """Means over a normal variable on the logit scale, by quadrature."""
 
-from __future__ import annotations
-
 from typing import NamedTuple, Self
 
 import numpy as np

@@ -12,8 +12,6 @@ the probability that each gave to the observations so far (Bayesian model averag
 A day's observations are added by expectation propagation (Minka 2001; Rasmussen and Williams 2006, §3.6).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce

@@ -1,7 +1,5 @@
 """Forecasts of slots side by side: each recorded day is forecast from the days of its class before it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

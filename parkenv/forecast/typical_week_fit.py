@@ -1,7 +1,5 @@
 """Condense counts of many car parks to a typical week, and how car parks and days differ from it."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 

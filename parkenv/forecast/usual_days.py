@@ -1,7 +1,5 @@
 """Forecasts of days drawn from counts: each as the other days of its class usually are."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit

@@ -1,7 +1,5 @@
 """Rows of parked cars: cars at the same offset from a street, and with the same heading."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Discover slots from the poses of detected cars, without a given map (T §6)."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

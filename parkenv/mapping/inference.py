@@ -1,7 +1,5 @@
 """Occupancy probability of each slot from survey sessions (T §3.3.3), by hour of the week (T §6)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

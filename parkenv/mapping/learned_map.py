@@ -1,7 +1,5 @@
 """A map that learns from every trip: an occupancy forecast, corrected by what searches observed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import groupby, product
 

@@ -1,7 +1,5 @@
 """Maps for other programs: the occupancy grid as Nav2's map server reads it, and the slots as GeoJSON."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

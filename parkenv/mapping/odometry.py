@@ -1,7 +1,5 @@
 """Localisation errors of the car: odometry that drifts, and the wandering error of a fused estimate (T §3.3)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

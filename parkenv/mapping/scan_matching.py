@@ -14,8 +14,6 @@ Only outlines that face the car count, as it sees no others. Points far from all
 count little or not at all. With fewer than `LEAST_POINTS` the pose follows the odometry.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """The map file: survey sessions and trips in an SQLite database, one transaction for each."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Lanes of an unknown street, along the drives or from a map, and the lot that they and discovered slots make."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Errors of detection and localisation in a survey session, measured against the simulated truth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

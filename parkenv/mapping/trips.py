@@ -1,7 +1,5 @@
 """What a car observed on a search, as it goes into the map."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Fit a car's rectangle to the end points of laser beams."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Labelled photographs of cars: the published UIUC car data set, and plain folders of crops."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

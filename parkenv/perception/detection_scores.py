@@ -1,7 +1,5 @@
 """Scores of a detector on labelled photographs: recall and precision by UIUC's matching rule, and recall on crops."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Detectors by name."""
 
-from __future__ import annotations
-
 import hashlib
 from importlib import resources
 from pathlib import Path

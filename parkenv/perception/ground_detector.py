@@ -1,7 +1,5 @@
 """A detector for a calibrated camera: cars stand on the ground, neither in the sky nor on the own bonnet."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -8,8 +8,6 @@ Gradients are those of the square root of the grey values (Dalal and Triggs 2005
 images then have similar strength, and the exposure changes only the scale.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

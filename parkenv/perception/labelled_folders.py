@@ -1,7 +1,5 @@
 """Photographs with labelled boxes, in the formats of COCO and YOLO, and crops of their cars for training."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Train a car model from aligned crops of cars, images without cars, and mined hard negatives."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

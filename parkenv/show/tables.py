@@ -1,7 +1,5 @@
 """Tables of results, for pages and terminals: declared columns, numbers in words, rows as cells."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple

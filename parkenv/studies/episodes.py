@@ -1,7 +1,5 @@
 """Run episodes of one agent in one scenario, and record them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

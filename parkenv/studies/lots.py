@@ -1,7 +1,5 @@
 """Lots under examination: clear lanes and closed one-way loops, a census, and imports of all car parks of a town."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

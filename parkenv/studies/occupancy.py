@@ -1,7 +1,5 @@
 """Fit models to recorded occupancy, and score forecasts of it: pictures into a folder, and what a summary holds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import date

@@ -1,7 +1,5 @@
 """Games: a person searches in the worlds of the agents, on a page that holds these worlds."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from typing import Any

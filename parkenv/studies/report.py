@@ -1,7 +1,5 @@
 """The page on a finished run: what its study says about it, its figures, and what it replays, run again."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

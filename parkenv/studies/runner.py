@@ -4,8 +4,6 @@
 run keeps all finished rows, and a resumed run equals an uninterrupted one.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import warnings

@@ -1,7 +1,5 @@
 """Simulate one episode: an agent acts in an environment until the episode ends."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass

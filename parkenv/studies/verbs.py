@@ -1,7 +1,5 @@
 """Run studies from Python, each by one call: the functions of `parkenv` that return results."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Run tasks in this process, in other processes of this machine, or on a Ray or Dask cluster."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import logging

@@ -4,8 +4,6 @@ Every arrival is drawn from its own random number, a pure function of the world'
 the rate has the same gaps, half as long.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

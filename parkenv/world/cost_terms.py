@@ -5,8 +5,6 @@ A new term is a row here, a line of `parkenv.engine.kernel` that charges it, and
 to `arrival_cost_s`, so that planners foresee it.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -1,7 +1,5 @@
 """Cues: what shows that a parked car is about to leave, such as somebody who gets in."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pydantic import ConfigDict

@@ -8,8 +8,6 @@ turn everywhere there: the chain ends at it, and its edges are the permitted tur
 million slots take seconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Laws of durations, such as stays and patience, and what follows from them for the cars that are parked."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Facilities: kerbs, car parks and garages that group slots, or that are counted instead of drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """Scenes of a parking lot for the simulated sensors."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import OrderedDict
 from dataclasses import replace

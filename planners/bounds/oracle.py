@@ -1,7 +1,5 @@
 """The clairvoyant lower bound: the least total time of an episode, and an agent that knows every slot's future."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -18,8 +18,6 @@ What is loose: the day is known; a whole group is seen at once; and when the tak
 known.
 """
 
-from __future__ import annotations
-
 import heapq
 from typing import Any, ClassVar, NamedTuple
 

@@ -1,7 +1,5 @@
 """Collision checks of the car's rectangular footprint against the exact outlines of obstacles."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ possible there, so it leaves the slot after few expansions, and a shot over the 
 kinematic path can be driven in both directions, so the result is reversed.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated

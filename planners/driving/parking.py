@@ -1,7 +1,5 @@
 """The planning parking agent: it plans a path among the obstacles, tracks it, and replans after deviations."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ radius, or straight lines. The words follow from eight formulas (their section 8
 right, and reversing the order of the pieces.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

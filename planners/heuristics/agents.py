@@ -1,7 +1,5 @@
 """Heuristic baselines: how people search, from their observations and without a forecast."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The heuristics as compiled policies, which drive the cars of a fleet without Python."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

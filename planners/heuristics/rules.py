@@ -12,8 +12,6 @@ Rules ask for the states of few slots. In a fleet they are computed from the tab
 for; an agent writes those of its observation into its `TABLES`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -19,8 +19,6 @@ and none is tried again while the driver remembers it.
 Places are searched over junctions instead of slots, in a fraction of the time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

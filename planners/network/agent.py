@@ -1,7 +1,5 @@
 """`network`: an agent that scores the actions at hand with one small network, the same on every lot."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from typing import ClassVar, Self

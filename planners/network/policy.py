@@ -3,8 +3,6 @@
 The file is a model file (see `planners.model_file`); it is read without PyTorch and the library of safetensors.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

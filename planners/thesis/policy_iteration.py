@@ -1,7 +1,5 @@
 """The thesis's solver: policy iteration (T §3.4.3, eq. 3.26-3.30)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

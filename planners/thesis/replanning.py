@@ -1,7 +1,5 @@
 """The thesis's agents: plan with the MDP, observe, update the belief, replan (T §3.4.4)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 

@@ -6,8 +6,6 @@ independent, constant slots given the day; the planner searches all of them at e
 the cost with the lowest mean time is chosen.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass

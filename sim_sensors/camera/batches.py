@@ -1,7 +1,5 @@
 """Batches of pixels of one kind that are shaded together, so that each step is one loop of vector instructions."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Light that reaches a point: from the sun, from the sky, and by mirror reflection."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shading of the ground: asphalt and grass in sun and shadow, and puddles."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

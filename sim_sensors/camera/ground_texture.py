@@ -1,7 +1,5 @@
 """Texture of the ground: asphalt with patches, cracks, oil and worn paint, drawn once per scene."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple

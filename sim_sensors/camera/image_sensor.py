@@ -1,7 +1,5 @@
 """Image sensor: lens blur, vignetting, exposure, shot and read noise, tone curve."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

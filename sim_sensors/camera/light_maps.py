@@ -1,7 +1,5 @@
 """Shadow maps around the camera: one for the sun, and one for the sky that vehicles hide from the ground."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 

@@ -1,7 +1,5 @@
 """Reflection models of the materials: car paint, foliage, dirt, glass."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ coordinates*, 1997). Clipping at the near plane therefore only determines which 
 even for triangles that extend behind the camera.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ threads. Most triangles are hidden: the far sides of cars, and cars behind cars.
 and a triangle that is farther than all that is drawn around it is skipped.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

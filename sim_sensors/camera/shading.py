@@ -4,8 +4,6 @@ The rasterizer has found the visible surfaces, so each pixel is shaded once, and
 of a kind are collected and shaded together.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ A texel of a map depends only on the instances above it, and on nothing that was
 and changed is the map that is drawn anew, bit for bit.
 """
 
-from __future__ import annotations
-
 import math
 from collections import OrderedDict
 from collections.abc import Sequence

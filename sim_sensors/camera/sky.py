@@ -3,8 +3,6 @@
 Above the horizon a view depends only on weather and rotation, so a camera that drives straight on draws its sky once.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import NamedTuple

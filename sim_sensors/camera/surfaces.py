@@ -4,8 +4,6 @@ Every triangle has a *finish*, a small number; a palette gives it a material and
 shape serves cars of many colours.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

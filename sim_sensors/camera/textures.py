@@ -1,7 +1,5 @@
 """Tileable noise, and image pyramids for compiled code."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any, NamedTuple
 

@@ -7,8 +7,6 @@ the smallest inverse range, and hits first the obstacle with the largest. So a b
 comparison, and no division. A rectangle shows at most two faces. A wall is a polygon of two corners.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

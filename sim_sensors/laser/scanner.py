@@ -1,7 +1,5 @@
 """Laser scanner: beams, noise, and scans of a `ScanPlane`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

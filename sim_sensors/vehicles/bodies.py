@@ -6,8 +6,6 @@ grille, seams and trim are cells of that sheet, so they have its curvature. The 
 between the shoulder and the roof's edge. Left and right are mirror images.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """The glasshouse of a vehicle and its interior: pillars, panes, roof, seats, dashboard."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -17,8 +17,6 @@ Widths, without mirrors, and heights span the makers' data for the models below,
 and 4.53 m × 1.84 m in 2023.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The proportions of a vehicle body, drawn from distributions for its type."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

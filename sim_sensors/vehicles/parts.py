@@ -1,7 +1,5 @@
 """Attached parts of a vehicle: wheels, lamp reflectors, number plates, mirrors, handles, rails, cladding."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Calibration files of cars: which sensors are where, and in which topics of a recording."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Folders of drives, photographs and films, with a table or a track of their poses, as sources of messages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Folders of the KITTI dataset, raw and odometry, as they come: Geiger et al., IJRR 2013."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Laser scans of a recording, each read with the angles and limits that its message states."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

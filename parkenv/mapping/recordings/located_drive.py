@@ -1,7 +1,5 @@
 """The cars of a recorded drive, located in each of its captures, and the session of a map that the drive becomes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Options of drives that are photographs or films: of a command, which must not wait for the modules that read them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from parkenv.files.option import numbers_in, option

@@ -1,7 +1,5 @@
 """Point clouds as scans of the obstacles above the road, with their heights, and the road's plane below the sensor."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

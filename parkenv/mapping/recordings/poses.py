@@ -1,7 +1,5 @@
 """Poses of a recording: of messages of poses, of a satellite receiver and its IMU, or of transforms."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

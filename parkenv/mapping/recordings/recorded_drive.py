@@ -7,8 +7,6 @@ the heading along the shorter arc; a pose at exactly that time is taken as it is
 left out. Times are those of the messages' headers, of messages without header those of the recording.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Topics, lenses and mounts of a recording's sensors: from its calibration file, and from what the recording says."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What reads recorded drives: `RecordedDrive` makes captures of the messages of any source."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Recordings of simulated drives: MCAP files of images, scans and poses, as `parkenv survey --record` writes them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tempfile

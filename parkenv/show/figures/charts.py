@@ -1,7 +1,5 @@
 """Charts as data: lines, names at their ends, panels and grids of panels, each with one renderer (Matplotlib)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Charts of many cars: time, price of anarchy, members; zones by hour; days that were counted; curves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import cycle

@@ -1,7 +1,5 @@
 """Figures of occupancy: forecasts and what was counted, and fitted rates."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import date
 from functools import partial

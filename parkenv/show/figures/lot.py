@@ -1,7 +1,5 @@
 """Pictures of lots, on which paths, beliefs and policies are drawn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

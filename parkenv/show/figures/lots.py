@@ -1,7 +1,5 @@
 """Pictures to check lots by: imports, discovered streets, contact sheets, and the chart of a census."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Pictures and films of manoeuvres in scenes, from above."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

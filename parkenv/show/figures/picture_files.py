@@ -1,7 +1,5 @@
 """Style of all figures, and functions that save them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain

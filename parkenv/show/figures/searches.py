@@ -1,7 +1,5 @@
 """Pictures of single searches, as in T Fig. 4.7 to 4.12."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Figures of sensors and surveys: captures, detections, one session's grid and slots, the map (T Fig. 4.4-4.7)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial

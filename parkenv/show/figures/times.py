@@ -1,7 +1,5 @@
 """Charts of searches: total times by part, setting and share of the searches; days of a commute; training."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Frames of a parking manoeuvre, from above."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Frames of a fleet, from above."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from parkenv.compiled.arrays import Image

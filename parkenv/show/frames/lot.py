@@ -1,7 +1,5 @@
 """The parts that frames of all environments share: the lot with its slots, the goal, and the line of text below."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

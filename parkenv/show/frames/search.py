@@ -1,7 +1,5 @@
 """Frames and text of a search, from above."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

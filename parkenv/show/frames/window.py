@@ -1,7 +1,5 @@
 """A window on the screen for `render_mode="human"`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Paint the layers of a scene on the axes of a figure (Matplotlib); its pixels are points of 1/72 inch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Record survey drives capture by capture for the replay of a report."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

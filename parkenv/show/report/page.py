@@ -1,7 +1,5 @@
 """The report page: data, figures, style sheet and scripts in one self-contained HTML file."""
 
-from __future__ import annotations
-
 import html
 import io
 import json

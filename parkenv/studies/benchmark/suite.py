@@ -11,8 +11,6 @@ deviations of their paired differences in each stratum follows how many of the s
 clairvoyant bound and of the occupancy at arrival are known for the whole population, and serve as control variates.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

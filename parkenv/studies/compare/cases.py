@@ -1,7 +1,5 @@
 """Compare agents in the same worlds: run their episodes in parallel and summarise them."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence

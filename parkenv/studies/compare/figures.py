@@ -1,7 +1,5 @@
 """The figures of a comparison, each a line of `FIGURES` that says which rows it shows."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

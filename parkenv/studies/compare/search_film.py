@@ -1,7 +1,5 @@
 """Film of a search through simulated sensors: the lot from above, the camera's view, captions, clock and legend."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The searches of a run, run again for the replay of its page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -6,8 +6,6 @@ times factors of the zone's own, shrunk towards 1 by as much as they may be chan
 search times are in units of the time to drive along all streets around a zone.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 A *zone* is a goal of the lot, and the spaces within a walk of it. Zones may have spaces in common.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 

@@ -16,8 +16,6 @@ where the stay begins or ends at the edge of a bin, or at the earliest or latest
 bound. At first all slots have the same rents, then parts of them that become ever smaller, then each slot has its own.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A town whose car parks were counted, and the demand that follows the counts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import date
 

@@ -1,7 +1,5 @@
 """Agents that drive the cars of a fleet, its demand, and its days as a log that single searches replay."""
 
-from __future__ import annotations
-
 import csv
 import gzip
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Settings of a study of many cars, and the columns of their days and tables."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

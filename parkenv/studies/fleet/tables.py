@@ -3,8 +3,6 @@
 A *block* is a facility, or where a lot has none, the slots of a tariff zone.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Detect cars in image files, videos and recorded drives, and draw them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Make the drive of a real car, or a recorded one, a session of a map file: with a lot, or of an unknown street."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count

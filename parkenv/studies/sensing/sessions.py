@@ -1,7 +1,5 @@
 """The table of a survey's sessions."""
 
-from __future__ import annotations
-
 from parkenv.studies.results import Table
 
 MAP_FILE = "map.sqlite"  # map of the sessions in the folder of a survey or a demo

@@ -1,7 +1,5 @@
 """Simulated sensors: a model fitted to the errors of the perception pipeline, and pictures of measurements."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Errors of a survey's sessions and of its map, and their pictures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training configs: settings of each algorithm that performed well."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self

@@ -1,7 +1,5 @@
 """The file of a training's evaluations, `curve.csv`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

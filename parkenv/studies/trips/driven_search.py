@@ -1,7 +1,5 @@
 """Whole trips: an agent decides on the drive graph, a simulated car drives into the slot; costs measured on trips."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

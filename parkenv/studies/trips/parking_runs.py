@@ -1,7 +1,5 @@
 """Parking by the planner on lots: its episodes, their table, pictures and a film."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial

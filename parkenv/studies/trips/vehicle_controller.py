@@ -1,7 +1,5 @@
 """Drive a car through a lot: along the lanes, into slots, and back out of slots that turn out to be taken."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Weekdays and times of day at which searches begin."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Annotated, Self

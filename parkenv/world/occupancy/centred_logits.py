@@ -1,7 +1,5 @@
 """Logits of slots on a day of average level, such that the mean over days is the forecast; see `day_error`."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Worlds that follow counts of car parks: hourly ones by a process; finer ones, and those of kerbs, by a log."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

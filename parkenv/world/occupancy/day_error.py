@@ -5,8 +5,6 @@ On a day with level L ~ N(0, level²) and slope S ~ N(0, slope²), slot i is tak
 `centre_i = centred_logits(p_i, sqrt(level² + (slope·nearness_i)²))`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -5,8 +5,6 @@ forecast's decay rate. Where the state is unknown it is drawn from this chain, g
 (forward filtering, backward sampling, in steps of `STEP_S`). So are, on demand, all states between two looks.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

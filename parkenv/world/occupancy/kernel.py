@@ -8,8 +8,6 @@ call these functions; only slots that a fleet shares are looked up before (`engi
 A *sojourn* is a period in which the state of a slot does not change.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

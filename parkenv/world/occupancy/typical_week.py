@@ -1,7 +1,5 @@
 """Weeks for any lot: a typical working one, and one as counted in real car parks, that of a lot file alone."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
