@@ -1,10 +1,8 @@
 """Subgraphs of large lots: the part of the drive graph that matters for a search, with all shortest drives in it."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +40,7 @@ class Neighborhood:
     cost_s: FloatArray  # (n_slots,) float64, s, arrival cost
 
     @classmethod
-    def of(cls, problem: SearchProblem, vertices: IntArray, entry: int) -> Neighborhood:
+    def of(cls, problem: SearchProblem, vertices: IntArray, entry: int) -> Self:
         lot = problem.lot
         whole, n_slots = len(vertices) == lot.n_vertices, int(np.searchsorted(vertices, lot.n_slots))
         neighbors, (starts, slots), rates = lot.neighbors, problem.slots_in_view, problem.sensor_rates

@@ -4,12 +4,10 @@ A picture is the scene of a lot, with further layers on top. `painters.opencv` p
 on the axes of a figure, and `report/lot_view.js` on the canvas of a page.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import shapely
@@ -229,7 +227,7 @@ class LotScene:
     area: DrivableArea  # the asphalt
 
     @classmethod
-    def of(cls, lot: ParkingLot) -> LotScene:
+    def of(cls, lot: ParkingLot) -> Self:
         corners = lot.slot_corners()
         first = np.array([0, 3, 1])[lot.slot_mouth]
         return cls(

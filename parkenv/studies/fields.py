@@ -1,10 +1,8 @@
 """Types of fields that several kinds of studies have."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -43,14 +41,14 @@ class AgentSpec(Spec):
     name: str
 
     @model_validator(mode="after")
-    def _plain_options(self) -> AgentSpec:
+    def _plain_options(self) -> Self:
         for option, value in self.options.items():
             if not isinstance(value, OptionValue) or value != value:
                 raise ValueError(f"{option} to be a number, true, false or text, not {value!r}")
         return self
 
     @classmethod
-    def of(cls, text: str) -> AgentSpec:
+    def of(cls, text: str) -> Self:
         return cls.parse(parse_call(text), "agent")
 
     @property
@@ -334,6 +332,15 @@ def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[Scena
     ):
         repeated = [name for i, name in enumerate(names) if name in names[:i]]
         require_together(not repeated, f"{what} has {next(iter(repeated), '')!r} twice")
+
+
+def require_agents(agents: Sequence[AgentSpec], scenarios: Sequence[Any]) -> None:
+    """Check that each agent can be made in each scenario."""
+    from planners.agent import make_agent
+
+    for scenario in scenarios:
+        for agent in agents:
+            make_agent(agent.name, scenario, **agent.options)
 
 
 def require_at_most(count: int, what: str, unit: str, most: int = MAX_EPISODES) -> None:

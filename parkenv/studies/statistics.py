@@ -1,7 +1,5 @@
 """Means with confidence intervals, and the summary rows of a comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
@@ -128,7 +126,7 @@ class Estimate(NamedTuple):
         return self.mean, self.mean - half, self.mean + half
 
     @classmethod
-    def combined(cls, parts: Iterable[tuple[float, Estimate]]) -> Self:
+    def combined(cls, parts: Iterable[tuple[float, Self]]) -> Self:
         """Return a weighted sum of independent estimates, given as (weight, estimate) (Welch and Satterthwaite)."""
         weights, estimates = zip(*parts, strict=True)
         means, errors, freedom = np.array(estimates).T

@@ -18,8 +18,6 @@ between two slots):
   other slot possibly could.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -150,7 +148,7 @@ class ExactSolution:
         self.n_states = len(self._keys)
         self.expected_s = float(self._values[0])
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> ExactSolution:
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self  # immutable: copies of a plan share it
 
     def decide(self, seen: int, vertex: int, free: int) -> tuple[float, int] | None:

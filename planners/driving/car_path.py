@@ -1,10 +1,9 @@
 """Paths of arcs for a car that drives forward and backward."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -34,7 +33,7 @@ class CarPath:
     def direction_changes(self) -> int:
         return count_changes(self.length[np.abs(self.length) > SHORTEST_ARC])
 
-    def reversed(self, start: FloatArray) -> CarPath:
+    def reversed(self, start: FloatArray) -> Self:
         """Return the path driven the other way, from its end, `start`, (3,)."""
         return dataclasses.replace(
             self, start=start, length=-self.length[::-1], curvature=self.curvature[::-1]

@@ -1,7 +1,5 @@
 """Manoeuvres: plan a path in a scene, and drive it with the vehicle's limits and rates."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time
@@ -45,6 +43,22 @@ _WAY_M, _WAY_CLEAR_M, _TIGHT_WAY_M = 2.0, 0.02, 3.2
 _BRAKING = 2.0  # m/s², for road users
 
 
+class Judgement(NamedTuple):
+    """Whether a manoeuvre ended at its target without a contact; clearance, m, and errors at the end, m and rad."""
+
+    driven: bool
+    contact: bool
+    clearance_m: float
+    error_m: float
+    error_rad: float
+
+    @property
+    def score(self) -> tuple[bool, bool, float]:
+        """Whether it was driven, and exactly enough, and the clearance up to the one that is enough."""
+        far = max(self.error_m / POSITION_TOLERANCE_M, self.error_rad / ANGLE_TOLERANCE_RAD)
+        return self.driven, self.driven and far <= _SURE, min(self.clearance_m, _CLOSE_M)
+
+
 @dataclass(frozen=True, eq=False)
 class Manoeuvre:
     """A planned and driven manoeuvre."""
@@ -84,22 +98,6 @@ class Manoeuvre:
         return Judgement(
             bool(arrived and stands and not check.contact), check.contact, check.clearance, away, turned
         )
-
-
-class Judgement(NamedTuple):
-    """Whether a manoeuvre ended at its target without a contact; clearance, m, and errors at the end, m and rad."""
-
-    driven: bool
-    contact: bool
-    clearance_m: float
-    error_m: float
-    error_rad: float
-
-    @property
-    def score(self) -> tuple[bool, bool, float]:
-        """Whether it was driven, and exactly enough, and the clearance up to the one that is enough."""
-        far = max(self.error_m / POSITION_TOLERANCE_M, self.error_rad / ANGLE_TOLERANCE_RAD)
-        return self.driven, self.driven and far <= _SURE, min(self.clearance_m, _CLOSE_M)
 
 
 def park(scene: Scene) -> Manoeuvre:

@@ -5,8 +5,6 @@ techniques for self-driving urban vehicles", 2016, §V): like the Stanley contro
 the lateral offset, but it is also stable in reverse, where feedback control of the front axle diverges.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -69,6 +67,17 @@ _AIMED = 0.02  # rad, of the wheels, before the car sets off
 _STANDS = 0.01  # m/s
 _RATE_SHARE = 0.8  # share of the steering rate available to the path; the rest is for corrections
 _REACTION_S = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class _Segment:
+    """A sampled path between two changes of direction."""
+
+    direction: float  # 1 forward, -1 backward
+    station: FloatArray  # (n,) m, distance from its start
+    poses: FloatArray  # (n, 3)
+    curvature: FloatArray  # (n,) 1/m
+    pace: FloatArray  # (n,) m/s, speed limit
 
 
 class PathTracker:
@@ -196,17 +205,6 @@ class LaneKeeper(PathTracker):
             bend = np.maximum(np.abs(segment.curvature), 1e-6)
             np.minimum(segment.pace, np.sqrt(aside / bend), out=segment.pace)
             _brake_ahead(segment.pace, segment.station, most)
-
-
-@dataclass(frozen=True, eq=False)
-class _Segment:
-    """A sampled path between two changes of direction."""
-
-    direction: float  # 1 forward, -1 backward
-    station: FloatArray  # (n,) m, distance from its start
-    poses: FloatArray  # (n, 3)
-    curvature: FloatArray  # (n,) 1/m
-    pace: FloatArray  # (n,) m/s, speed limit
 
 
 def _segments(vehicle: VehicleParameters, path: CarPath, settings: TrackingSettings) -> list[_Segment]:

@@ -8,10 +8,8 @@ An action is one of the four moves, parking, or waiting. A token is a slot seen 
 drive to it if the car takes the action, and its arrival cost.
 """
 
-from __future__ import annotations
-
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +78,7 @@ class Features(NamedTuple):
     lookahead_s: FloatArray  # (6,) s, expected time by the look-ahead; inf for actions that there are not
 
     @classmethod
-    def empty(cls) -> Features:
+    def empty(cls) -> Self:
         return cls(
             np.zeros((ACTION_COUNT, ACTION_FEATURES), np.float32),
             np.zeros((ACTION_COUNT, CANDIDATES, TOKEN_FEATURES), np.float32),

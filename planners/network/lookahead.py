@@ -5,9 +5,7 @@ expected time of a car that stops at the first slot that is better than going on
 is remembered along the path, the path is short, and no target is inserted: a path takes microseconds.
 """
 
-from __future__ import annotations
-
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -35,7 +33,7 @@ class Scratch(NamedTuple):
     slots: IntArray  # (MOST_OBSERVATIONS,) slots to reset in `seen_at`
 
     @classmethod
-    def of(cls, n_slots: int, n_hypotheses: int) -> Scratch:
+    def of(cls, n_slots: int, n_hypotheses: int) -> Self:
         return cls(
             np.full(n_slots, -1.0),
             np.zeros(n_hypotheses),

@@ -28,10 +28,8 @@ affect a handful of vertices, whatever the size of the lot. If a change reaches 
 planning from scratch is faster and is done instead.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +69,7 @@ class StoppingGraph(NamedTuple):
     gamma: float  # discount per decision
 
     @classmethod
-    def of(cls, mdp: ParkingMDP) -> StoppingGraph:
+    def of(cls, mdp: ParkingMDP) -> Self:
         # Copies: numba would compile every function again for read-only arrays.
         neighbors, move_s = mdp.neighbors.astype(np.int32), np.array(mdp.move_s, order="C")
         start, source, move, seconds = edges_in(neighbors, move_s)

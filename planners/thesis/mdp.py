@@ -1,9 +1,8 @@
 """The thesis's Markov decision process of parking search (T §3.4.2)."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -114,7 +113,7 @@ class ParkingMDP:
         *,
         failure_s: float | None = None,
         gamma: float | None = None,
-    ) -> ParkingMDP:
+    ) -> Self:
         """Make the thesis's process from a belief about the slots.
 
         Args:

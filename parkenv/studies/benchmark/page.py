@@ -1,12 +1,10 @@
 """A page of the results that were submitted for the benchmark suite: the leaderboard."""
 
-from __future__ import annotations
-
 import itertools
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.special import ndtri
@@ -49,7 +47,7 @@ class Entry(NamedTuple):
     result: Row
     times: Mapping[str, FloatArray]  # total time of each search, s, by task
 
-    def minus(self, other: Entry) -> dict[str, FloatArray]:
+    def minus(self, other: Self) -> dict[str, FloatArray]:
         return {task: times - other.times[task] for task, times in self.times.items()}
 
 

@@ -39,7 +39,7 @@ from parkenv.scenarios.build import build, make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.compare.cases import Case, at_occupancy, check_worlds, require_distinct, table
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.fields import AgentSpec
+from parkenv.studies.fields import AgentSpec, require_agents
 from parkenv.studies.results import SETTING_COLUMNS, Key, Row, decision_s, without_nan
 from parkenv.studies.statistics import (
     Estimate,
@@ -62,6 +62,9 @@ from planners.agent import make_agent
 CONTROLS = ("bound_s", "occupancy")
 SEARCHES_ON, FIRST_SEED_ON = 250, 9_000_000  # of the protocol in another world: searches of each task
 SUITES = Path(__file__).parent / "suites"
+
+
+World = tuple[Scenario, Sequence[int]]  # a task's scenario, and the seeds of its searches
 
 
 @dataclass(frozen=True)
@@ -132,17 +135,7 @@ class Suite:
         return cls(content["name"], content["description"], arrival, tasks, sha256_of(content))
 
     def cases(self, agents: Sequence[AgentSpec]) -> list[Cell]:
-        worlds = [task.made(self.arrival) for task in self.tasks]
-        for world in worlds:
-            for agent in agents:
-                make_agent(agent.name, world, **agent.options)
-        cells = [
-            Cell(Case(world, agent.name, options=agent.options), task.seeds)
-            for task, world in zip(self.tasks, worlds, strict=True)
-            for agent in agents
-        ]
-        require_distinct(case for case, _ in cells)
-        return cells
+        return _cells([(task.made(self.arrival), task.seeds) for task in self.tasks], agents)
 
     def cases_on(self, world: ScenarioSpec, agents: Sequence[AgentSpec]) -> list[Cell]:
         """Return the suite's protocol in another world: its hours and goals, with `SEARCHES_ON` searches each.
@@ -151,7 +144,7 @@ class Suite:
         count once. Hours before or after those of a log are cut. A task is left out with a warning if no such hour or
         day is recorded, or a day has no others to forecast it from.
         """
-        cells, seen, faults = list[Cell](), set[tuple[Any, ArrivalWindow]](), list[str]()
+        worlds, seen, faults = list[World](), set[tuple[Any, ArrivalWindow]](), list[str]()
         n_goals = len(build(world).lot.goals)
         for number, task in enumerate(self.tasks):
             window = task.window(self.arrival)
@@ -167,14 +160,22 @@ class Suite:
             except InputError as error:
                 faults.append(f"task {task.name} is left out: {error}")
                 continue
-            for agent in agents:
-                make_agent(agent.name, scenario, **agent.options)
-                cells.append(Cell(Case(scenario, agent.name, options=agent.options), seeds))
-        require(cells, f"{world.source}: no task can be run; {next(iter(faults), '')}")
+            worlds.append((scenario, seeds))
+        require(worlds, f"{world.source}: no task can be run; {next(iter(faults), '')}")
         for fault in faults:
             warnings.warn(fault, stacklevel=2)
-        require_distinct(case for case, _ in cells)
-        return cells
+        return _cells(worlds, agents)
+
+
+def _cells(worlds: Sequence[World], agents: Sequence[AgentSpec]) -> list[Cell]:
+    require_agents(agents, [scenario for scenario, _ in worlds])
+    cells = [
+        Cell(Case(scenario, agent.name, options=agent.options), seeds)
+        for scenario, seeds in worlds
+        for agent in agents
+    ]
+    require_distinct(case for case, _ in cells)
+    return cells
 
 
 def _recorded_part(window: ArrivalWindow, occupancy: OccupancyModel) -> ArrivalWindow:

@@ -25,6 +25,7 @@ from parkenv.studies.fields import (
     Scenarios,
     Seed,
     listed,
+    require_agents,
     require_at_most,
     require_distinct_names,
 )
@@ -147,11 +148,7 @@ class Commute(Study):
         return {scenario.name: calendar(scenario, self.days) for scenario in self.built}
 
     def check(self) -> None:
-        from planners.agent import make_agent
-
-        for scenario in self.built:
-            for agent in self.agents:
-                make_agent(agent.name, scenario, **agent.options)
+        require_agents(self.agents, self.built)
         name, count = Counter(tuple(run.columns.values()) for run in self.runs).most_common(1)[0]
         require(count <= 1, f"two agents are called {name[2]!r}, want different names")
         for run in self.runs[:: self.drivers]:

@@ -29,6 +29,7 @@ from parkenv.studies.fields import (
     Scenarios,
     Seed,
     Values,
+    require_agents,
     require_at_most,
     require_distinct_names,
     require_rig,
@@ -268,11 +269,8 @@ class Comparison(CaseStudy):
 
     def check(self) -> None:
         from parkenv.studies.compare.cases import BUDGET, check_worlds, require_distinct
-        from planners.agent import make_agent
 
-        for scenario in self._base_scenarios:
-            for agent in self.agents:
-                make_agent(agent.name, scenario, **agent.options)
+        require_agents(self.agents, self._base_scenarios)
         if self.rig is not None:
             from parkenv.perception.detector_registry import make_detector
 

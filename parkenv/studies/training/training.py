@@ -42,7 +42,7 @@ from parkenv.show.figures.times import save_learning_curves
 from parkenv.show.tables import plural
 from parkenv.studies.compare.cases import Case, rows_of
 from parkenv.studies.compare.search_replay import search_replay
-from parkenv.studies.fields import AgentSpec
+from parkenv.studies.fields import AgentSpec, require_agents
 from parkenv.studies.results import Results, Row, fingerprints, flat_tables
 from parkenv.studies.simulate import EpisodeResult, Observer, Step, charge_truncation, simulate
 from parkenv.studies.statistics import mean_interval
@@ -135,9 +135,7 @@ class Training:
         learned = self.sides[0]
         if self.spec.clone is not None:
             require_cloneable(self.spec.algorithm, self.spec.clone, learned[0])
-        for world in (learned[0], *(places[0] for places in self.tests.values())):
-            for agent in self.compared:
-                make_agent(agent.name, world, **agent.options)
+        require_agents(self.compared, [learned[0], *(places[0] for places in self.tests.values())])
 
     def settings(self) -> Row:
         given = (*self.spec.scenarios, *(self.spec.evaluate_on or ()))
