@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ from parkenv.engine.kernel import (
     take_step,
     write_clock,
 )
-from parkenv.engine.policy import CompiledPolicy, car_of
+from parkenv.engine.policy import CompiledPolicy, PolicyData, car_of
 from parkenv.engine.records import (
     CAR,
     FLEET,
@@ -435,6 +436,10 @@ def _last_observations(slots: SlotBelief, forecast: FloatArray) -> Observations:
 # ---- compiled
 
 
+# Data of policies that drive simulations, by the scenario that they were made for, which tree searches run many times.
+_DATA = WeakKeyDictionary[ScenarioRecords, dict[CompiledPolicy, PolicyData | None]]()
+
+
 def _policy_batch(searches: Searches, policy: CompiledPolicy) -> tuple[int, list[Any]]:
     """Return the address of a FLEET record with a car for each search of one scenario, and what keeps it alive.
 
@@ -445,7 +450,8 @@ def _policy_batch(searches: Searches, policy: CompiledPolicy) -> tuple[int, list
     moves = np.zeros((n, 2 * problem.lot.n_vertices), np.uint8)
     searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
     cars["search"], cars["target"] = searches.address + np.arange(n) * SEARCH.itemsize, NO_SLOT
-    data = policy.data_for([problem])
+    known = _DATA.setdefault(searches.scenarios, {})
+    data = known[policy] if policy in known else known.setdefault(policy, policy.data_for([problem]))
     data_at = np.array([0 if data is None else data.address], np.int64)
     fleet["cars"], fleet["policy_data"] = address_of(cars, CAR), address_of(data_at, np.int64)
     return address_of(fleet, FLEET), [cars, fleet, moves, data, data_at]

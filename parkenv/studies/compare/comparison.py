@@ -391,19 +391,27 @@ class Comparison(CaseStudy):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: the agents that none beats in the first setting; the table marks those of all."""
+        """See `Study`: the fastest agent of the first setting, and those that the searches cannot tell from it."""
 
         def setting(row: Row) -> tuple[Any, ...]:
             return row["scenario"], *(row[name] for name in SETTING_AXES)
 
         first, *_ = rows = summary["rows"]
         agents = [row for row in rows if setting(row) == setting(first) and row["agent"] not in UNBEATEN]
-        leaders = ", ".join(f"{row['agent']} ({row['total_s']:.1f} s)" for row in agents if row["leads"])
+
         where = f"On {first['scenario']}, failure cost {first['failure_cost_s']:g} s"
         for axis, what in (("v_walk_kmh", "walking"), ("v_drive_kmh", "driving")):
             if len({row[axis] for row in rows}) > 1:
                 where += f", {what} at {first[axis]:g} km/h"
-        findings = [f"{where}, no agent is clearly faster than {leaders}."] if len(agents) > 1 else []
+        findings = []
+        if len(agents) > 1:
+            best, *unsure = sorted(
+                (row for row in agents if row["leads"]), key=lambda row: float(row["total_s"])
+            )
+            named = ", ".join(f"{row['agent']} ({row['total_s']:.1f} s)" for row in unsure)
+            searches = plural(best["episodes"], "search", "searches")
+            rest = f"{searches} cannot tell {named} from it" if unsure else "all others are slower"
+            findings.append(f"{where}, {best['agent']} is fastest ({best['total_s']:.1f} s); {rest}.")
         if (measured := summary.get("calibrated")) is not None:
             findings.append(
                 f"Calibrated over {plural(measured['trips'], 'trip')}: failure cost {measured['failure_s']:.4g} s, "
