@@ -29,8 +29,6 @@ class PlayedSearch(Spec):
 
 
 class Scores(Spec):
-    """Content of a file of scores."""
-
     scenario: str
     worlds: Several[PlayedSearch] = Field(min_length=1, max_length=10_000)
 

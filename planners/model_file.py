@@ -88,7 +88,6 @@ class PolicyOptions(_WithNulls):
     enable_critic_lstm: bool | None = None
 
     def arguments(self) -> dict[str, Any]:
-        """Return the keyword arguments, with classes instead of names."""
         import torch
 
         given = self.model_dump(exclude_none=True)
@@ -211,7 +210,6 @@ def save_model(
 
 
 def slots_observed(space: spaces.Space[Any]) -> int:
-    """Return k of a model's observation space."""
     shape = space["local"].shape if isinstance(space, spaces.Dict) and "local" in space.spaces else None
     k = (shape[0] - FIRST_NEAR) // PER_NEAR if shape else 0
     require(k >= 1 and space == local_space(k), "the model does not observe `local`")

@@ -64,7 +64,6 @@ class Neighborhood:
 
     @property
     def slots(self) -> IntArray:
-        """The slots' numbers in the lot, (n_slots,)."""
         return self.vertices[: self.n_slots]
 
     def index(self, vertex: int) -> int:
@@ -73,7 +72,6 @@ class Neighborhood:
         return i if i < len(self.vertices) and self.vertices[i] == vertex else -1
 
     def in_view(self, vertex: int) -> NDArray[Any]:
-        """Return the `VIEW` records of a vertex, both numbered as in this subgraph."""
         return self.views[self.view_starts[vertex] : self.view_starts[vertex + 1]]
 
     def planning_graph(self, problem: SearchProblem, failure_s: float) -> PlanningGraph:

@@ -24,8 +24,6 @@ NOWHERE = np.zeros(0, dtype=np.bool_)
 
 
 class DriveRoutes:
-    """Drive times from a vertex, and shortest routes."""
-
     def __init__(self, problem: SearchProblem) -> None:
         # Copies: numba would compile every function again for read-only arrays.
         self._neighbors, self._move_s = problem.lot.neighbors.copy(), problem.move_cost_s.copy()
@@ -57,7 +55,6 @@ class DriveRoutes:
         return np.flatnonzero(slots & (seconds[: len(slots)] == least)), least
 
     def move_toward(self, vertex: int, target: int) -> int:
-        """Return the first move of a shortest route."""
         moves = self._moves.setdefault(target, {})
         self._moves.move_to_end(target)
         if len(self._moves) > _KEPT_TARGETS:

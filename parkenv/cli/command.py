@@ -88,8 +88,6 @@ PANELS = ("Options", "Costs and speeds", "World", "Sensors", "Results", "Trust",
 
 
 class Entry(NamedTuple):
-    """A line of the list of commands."""
-
     summary: str  # what the command does, in a sentence
     # its class, `MODULE:CLASS` below `parkenv.cli`, or its kind of study; empty for a group of commands
     source: str = ""
@@ -97,8 +95,6 @@ class Entry(NamedTuple):
 
 
 class _Page:
-    """The parts of a help page: text, examples, and parameters under their headings."""
-
     help: str | None
     params: list[Any]
     examples: str = ""

@@ -60,8 +60,7 @@ class Command(Spec):
         self.console.print(text, **how)
 
     @abstractmethod
-    def run(self) -> None:
-        """Run it, and print what it found."""
+    def run(self) -> None: ...
 
 
 def command_class(source: str) -> Any:
@@ -73,11 +72,10 @@ def command_class(source: str) -> Any:
 
 @dataclass(frozen=True)
 class FieldOption:
-    """An option of a command: a field of its specification, or of a table in it."""
-
     path: tuple[str, ...]  # names of the tables, and of the field
     field: FieldInfo
     option: Option  # how it is given on the command line
+    model: type[Spec]  # class of the table that the field belongs to
 
     @property
     def name(self) -> str:
@@ -164,7 +162,7 @@ def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[Fie
         marks = {mark.name: mark for mark in field.metadata if isinstance(mark, Option)}
         if not marks and name in of_command and not any(models_in(field.annotation)):
             marks = {"": Option()}
-        own += [FieldOption((*path, name), field, mark) for mark in marks.values()]
+        own += [FieldOption((*path, name), field, mark, model) for mark in marks.values()]
     names = {option.name for option in own}
     for name, field in model.model_fields.items():
         yield from (option for option in own if option.path[-1] == name)

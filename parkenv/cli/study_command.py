@@ -42,8 +42,6 @@ class RunCommand(Command):
 
 
 class StudyCommand(RunCommand):
-    """A command that runs one kind of study; see `study_command`."""
-
     study: Study
 
     @classmethod

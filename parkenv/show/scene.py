@@ -158,7 +158,6 @@ class Marks:
     opacity: float = 1.0
 
     def sizes(self, scale: float, least: float) -> FloatArray:
-        """Return length and width of each, (n, 2), at a scale and of a least length."""
         size = scale * np.broadcast_to(np.asarray(self.size, dtype=np.float64), (len(self.poses), 2))
         long = size[:, :1]
         # Shapes without a size of their own are as wide as long.
@@ -279,7 +278,6 @@ class LotScene:
         ]
 
     def data(self) -> dict[str, Any]:
-        """Return the `lot` of a page: lengths in m, rounded to centimetres."""
         lot = self.lot
         entries = Marks(self.entries, ARROWHEAD, "entry", (2.4, 2.4), px=13.0)
         return {

@@ -50,8 +50,6 @@ SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # columns of a s
 
 
 class Column(NamedTuple):
-    """Format of a column."""
-
     key: str  # in the summary
     label: str  # heading
     unit: str = ""  # of the numbers; empty for none

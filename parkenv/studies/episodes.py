@@ -97,7 +97,6 @@ class EpisodeRunner:
         return self._bound_s()
 
     def run(self, seed: int, observers: Sequence[Observer] = (), *, moments: bool = False) -> SearchRecord:
-        """Run one search in the world of `seed`; with `moments`, the record holds each step."""
         recorder = SearchRecorder(self.agent, steps=moments)
         result = simulate(self.env, self.agent, seed, (recorder, *observers))
         metrics = {

@@ -30,8 +30,6 @@ from parkenv.version import __version__
 
 
 class Summary(Spec, extra="allow"):
-    """Content of `summary.json`, of any kind of run."""
-
     command: Several[str] = Field(min_length=2)
     version: str
     seed: int | None = Field(None, ge=0, le=10**15)
@@ -40,8 +38,6 @@ class Summary(Spec, extra="allow"):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A finished run."""
-
     path: Path
     summary: Mapping[str, Any]  # content of `summary.json`
     kind: str  # compare, survey, ...; the command's name if the folder holds no specification

@@ -122,7 +122,6 @@ def _stored(folder: Path, tables: Sequence[Table]) -> dict[str, dict[Key, Row]]:
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
-    """Write a command's summary as strict JSON; NaN becomes null."""
     write_text(folder / name, json.dumps(without_nan(summary), indent=2, allow_nan=False) + "\n")
 
 
@@ -333,7 +332,6 @@ def flat_tables(tables: Mapping[str, Any], before: str = "") -> Row:
 
 
 def fingerprints(files: Iterable[Path]) -> dict[str, str]:
-    """Return a short hash of each file's content, by path, so that a resumed run detects changed files."""
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in files}
 
 

@@ -17,8 +17,6 @@ STEP_LIMIT = 2000
 
 
 class Step(NamedTuple):
-    """One decision and its outcome."""
-
     observation: Any  # observation before the decision
     action: Any  # action chosen by the agent
     memory: Any  # the agent's state after the decision; it may change with the next decision

@@ -114,8 +114,6 @@ def success_columns(name: str, successes: int, trials: int) -> dict[str, Any]:
 
 
 class Estimate(NamedTuple):
-    """An estimated mean."""
-
     mean: float
     error: float  # its standard error
     freedom: float  # degrees of freedom of the standard error

@@ -130,8 +130,6 @@ class NotInRunError(InputError):
 
 
 class ReportOptions(Spec):
-    """What a page replays."""
-
     episodes: int | None = option(
         None,
         "About how many episodes to replay, all agents together.",
@@ -318,8 +316,6 @@ class Study(ExecutionSpec):
 
 
 class Stage(NamedTuple):
-    """Cells of a study that may run at the same time."""
-
     doing: str  # what the progress bar says
     study: Study
     cells: Sequence[Cell]
@@ -340,7 +336,6 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 
 def read_study(file: Path) -> Any:
-    """Read the specification of a study; its key `kind` says which, `compare` if absent."""
     tables = read_tables(file)
     study = study_class(tables.get("kind", "compare"), str(file))
     return study.parse(tables, str(file), file.parent).of_file(file)

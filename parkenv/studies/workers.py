@@ -89,7 +89,6 @@ class Workers:
 
     @property
     def in_process(self) -> bool:
-        """Whether tasks run in this process."""
         return self.backend == "loky" and self.jobs == 1
 
     def results(self, tasks: Sequence[Task[Result]]) -> Iterator[tuple[int, Result]]:

@@ -298,7 +298,6 @@ def _drive_within_known(vertex: int, seen: int, lot: _SmallLot) -> FloatArray:
 
 @compiled
 def _least_cost(slots: int, drive_s: FloatArray, cost_s: FloatArray) -> float:
-    """Return the least drive plus arrival cost, s, over a set of slots; inf if it is empty."""
     least = np.inf
     for s in range(len(cost_s)):
         if (slots >> s) & 1:
@@ -413,8 +412,6 @@ def _back_up(
 
 @dataclass
 class ExactState:
-    """Memory of the exact agent."""
-
     before: SlotBelief  # belief before the first observation
     solution: ExactSolution  # the most recent solution
     seen: int = 0  # slots observed, as a bit mask

@@ -18,8 +18,6 @@ _ASKED_AT_ONCE = 64  # slots, in one question to a world
 
 @dataclass(frozen=True)
 class BestSlot:
-    """The best slot of an episode."""
-
     slot: int  # its index; -1 if no slot ever becomes free
     wait_s: float  # s between the earliest possible arrival and parking
     total_s: float  # s, drive, wait and arrival cost; inf if there is none
@@ -77,8 +75,6 @@ def _first_free(
 
 @dataclass
 class OracleState:
-    """Memory of the oracle."""
-
     slot: int  # the target; -1 if it proves the lot full, or if no slot ever becomes free
     waits: int  # number of waits before it drives there
     # (n_slots,) bool, slots still to be observed to prove the lot full; None if it parks

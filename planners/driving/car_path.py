@@ -16,8 +16,6 @@ _STRAIGHT = 1e-5  # rad
 
 @dataclass(frozen=True, eq=False)
 class CarPath:
-    """A sequence of arcs driven forward or backward."""
-
     start: FloatArray  # (3,) x, y in m and yaw in rad of the rear axle
     length: FloatArray  # (k,) length of each arc, m, negative backward
     curvature: FloatArray  # (k,) 1/m, positive to the left

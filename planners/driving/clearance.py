@@ -23,8 +23,6 @@ _UNSURE = math.sqrt(2.0) * CELL_M + 0.5 * _SAMPLE_M
 
 
 class Clearance(NamedTuple):
-    """Obstacles and distance field for compiled collision checks."""
-
     # (n, k_max, 2) float64, m: convex outlines in either orientation; lines have two corners
     corners: FloatArray
     n_corners: IntArray  # (n,) int64

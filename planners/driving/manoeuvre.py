@@ -61,8 +61,6 @@ class Judgement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Manoeuvre:
-    """A planned and driven manoeuvre."""
-
     scene: Scene
     path: CarPath | None  # the path that was driven; None if none was found
     # (n, 6) states of the vehicle every `PHYSICS_S` from the start on; see `parkenv.driving.vehicle`

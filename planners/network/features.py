@@ -55,8 +55,6 @@ TOKEN_FEATURES = 14
 
 
 class Situation(NamedTuple):
-    """Where the car is and what it may do; vertices are numbered as in the planning graph."""
-
     here: int
     previous: int  # vertex before, or -1
     following: IntArray  # (4,) vertex after each move, or -1
@@ -70,8 +68,6 @@ class Situation(NamedTuple):
 
 
 class Features(NamedTuple):
-    """Observation of the network at one decision."""
-
     actions: NDArray[np.float32]  # (6, ACTION_FEATURES), the four moves, parking, waiting
     tokens: NDArray[np.float32]  # (6, CANDIDATES, TOKEN_FEATURES)
     allowed: NDArray[np.bool_]  # (6,), the actions that there are

@@ -21,8 +21,6 @@ ENOUGH = 0.02  # P(nothing found) at which a path ends
 
 
 class Scratch(NamedTuple):
-    """Buffers for one path."""
-
     seen_at: FloatArray  # (n_slots,) s, when the path observed each slot last; -1 if it did not
     weights: FloatArray  # probabilities of the hypotheses about the day along the path
     time: FloatArray  # (MOST_STOPS + 1,) s
@@ -47,8 +45,6 @@ class Scratch(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """A decision, as the look-ahead reads it."""
-
     by_cost: IntArray  # (n_slots,) the slots, least arrival cost first
     options: IntArray  # (k,) slots known to be free now that are considered
     fallback_s: float  # s, time of the search if such a slot is gone
@@ -140,8 +136,6 @@ def path_value(vertex: int, start_s: float, failure_s: float, decision: Decision
 
 
 class Sums(NamedTuple):
-    """Sums over the observations of a path."""
-
     p_none: float  # P(no slot that is worth parking in is free)
     p_free: float
     cost_s: float  # weighted by P(free)

@@ -33,8 +33,6 @@ MOST_HOPS = 400  # maximum number of vertices of a plan preview
 
 @dataclass
 class Plan:
-    """Memory of an agent that plans."""
-
     graph: StoppingGraph  # the stopping problem
     labels: Labels  # cost and move of each vertex, and the probabilities of the plan
     day: DayBelief | None = None  # belief about the day, for an agent that learns it

@@ -37,8 +37,6 @@ _KEPT = 256
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """Result of the simulation."""
-
     costs: FloatArray  # (k,) float64, s, the failure costs compared
     mean_s: FloatArray  # (k,) float64, s, mean total time of the planner at each cost, in the same worlds
 
@@ -180,20 +178,9 @@ def _best_target(vertex: int, cost: float, graph: PlanningGraph, odds: FloatArra
 
 
 @dataclass
-class TunedPlan:
-    """Memory of the tuned planner."""
-
-    failure_s: float  # s, the chosen failure cost
-    entry: int  # the vertex to drive to before following the plan, or -1
-    plan: Plan  # memory of the thesis's planner
-
-    @property
-    def replans(self) -> int:
-        return self.plan.replans
-
-    @property
-    def policy(self) -> NDArray[np.int64]:
-        return self.plan.policy
+class TunedPlan(Plan):
+    failure_s: float = 0.0  # s, the chosen failure cost
+    entry: int = -1  # the vertex to drive to before following the plan, or -1
 
 
 class TunedAgent(SearchAgent[TunedPlan]):
@@ -250,7 +237,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
             self._planners[best] = ReplanningAgent(self.problem, failure_s=best, gamma=self.gamma)
         near = self._neighborhoods.toward(vertex)
         entry = near.entry if near.index(vertex) < 0 else -1
-        return TunedPlan(best, entry, self._planners[best].begin(observation, belief))
+        return TunedPlan(**vars(self._planners[best].begin(observation, belief)), failure_s=best, entry=entry)
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: TunedPlan) -> int:
         vertex = int(observation["vertex"])
@@ -258,9 +245,9 @@ class TunedAgent(SearchAgent[TunedPlan]):
             memory.entry = -1
         if memory.entry >= 0:
             return self._routes.move_toward(vertex, memory.entry)
-        return self._planners[memory.failure_s].decide(observation, belief, memory.plan)
+        return self._planners[memory.failure_s].decide(observation, belief, memory)
 
     def plan_preview(self, observation: Observation, action: int, memory: TunedPlan) -> tuple[int, ...]:
         if memory.entry >= 0:
             return self._routes.path(int(observation["vertex"]), memory.entry)
-        return self._planners[memory.failure_s].plan_preview(observation, action, memory.plan)
+        return self._planners[memory.failure_s].plan_preview(observation, action, memory)

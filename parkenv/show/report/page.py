@@ -95,7 +95,6 @@ def page_data(
 
 
 def terms_data() -> list[dict[str, Any]]:
-    """Return the `terms` of a page: what a search can cost."""
     return [{"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS]
 
 
@@ -105,7 +104,6 @@ def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()
 
 
 def write_game(data: Mapping[str, Any], path: Path) -> None:
-    """Write the page of a game atomically; see `parkenv.studies.play.game_data`."""
     _write(path, "game.html", data, GAME_SCRIPTS, game=_part("game.css"))
 
 

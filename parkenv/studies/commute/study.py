@@ -213,7 +213,6 @@ class Commute(Study):
     def printed(cls, summary: Row, folder: Path) -> list[Row]:
         from parkenv.show.tables import spread, table_of
 
-        del folder
         weeks, tables = summary["weeks"], []
         for title, measure, digits in (
             ("Mean total time, s", "total_s", 1),

@@ -61,7 +61,6 @@ class Case:
 
     @property
     def planner(self) -> str:
-        """The label without the time for a decision, `BUDGET`, of which the agent may have several."""
         options = {name: value for name, value in self.options.items() if name != BUDGET}
         return label_of(shown_name(self.agent), options)
 

@@ -34,8 +34,6 @@ OCCUPANCY_BINS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
 
 @dataclass(frozen=True)
 class ComparisonResults:
-    """Results from which the figures of a comparison are drawn."""
-
     cases: Sequence[tuple[Case, Sequence[int]]]
     episodes: Mapping[tuple[Any, ...], Row]
     rows: Sequence[Row]
@@ -157,7 +155,6 @@ FIGURES: Mapping[str, tuple[str, Callable[[ComparisonResults], Drawn]]] = {
 def draw_figures(
     results: ComparisonResults, folder: Path, names: Sequence[str] = tuple(FIGURES)
 ) -> list[Path]:
-    """Draw figures of a comparison to PNG files, `NAME_SCENARIO_SETTING.png`."""
     files = []
     for name in names:
         caption, draw = FIGURES[name]
@@ -172,7 +169,6 @@ def draw_figures(
 
 
 def remove_figures(folder: Path) -> None:
-    """Delete the figures of an earlier comparison from a folder."""
     for picture in folder.glob("*.png"):
         if picture.name.startswith(tuple(f"{name}_" for name in FIGURES)):
             picture.unlink()

@@ -35,8 +35,6 @@ _CAMERA = (213, 160)
 
 
 class SearchFilm:
-    """Film of a search in `parkenv/SearchPerception-v2`."""
-
     def __init__(self, record: SearchRecord) -> None:
         self._record, self._scenario = record, record.scenario
         self.frames: list[Image] = []

@@ -238,6 +238,5 @@ class CurveStudy(FleetSpec):
     def page_tables(cls, summary: Row, folder: Path) -> list[Row]:
         from parkenv.studies.curve.curves import PREDICTORS
 
-        del folder
         labels = Column("held_out", "held out"), Column("outcome", "outcome")
         return tables_of(summary, cls.table_titles, (*COLUMNS, *labels, *PREDICTORS.values(), *_ERRORS))

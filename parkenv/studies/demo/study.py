@@ -45,8 +45,6 @@ _APART = 1_000_000  # offset between the seeds of survey and searches, so that t
 
 
 class _RecordedSurvey(SurveyStudy):
-    """A survey whose first session is recorded for the report."""
-
     doing: ClassVar = "1/3 survey drives"
 
     def drive(self, number: int) -> tuple[SessionResult, Any]:

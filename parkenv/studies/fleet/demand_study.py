@@ -178,7 +178,6 @@ class DemandStudy(Study):
         return [{"date": items[0], **lines}]
 
     def label(self, work: _RollOut) -> str:
-        del work
         return self.agent.label
 
     def summarise(self, results: Results) -> Row:

@@ -129,7 +129,6 @@ def write_drives(
     of_slots: Sequence[dict[str, Any]] = (),
     kerbs: Sequence[FloatArray] = (),
 ) -> None:
-    """Write the slots of a map, and the cars and the occupancy grid of its new drives."""
     write_slots(folder / "slots.geojson", lot, log, frame, of_slots, kerbs)
     write_csv(folder / "cars.csv", CAR_COLUMNS, [row for one in drives for row in one.cars])
     write_csv(folder / "sightings.csv", SIGHTING_COLUMNS, [row for one in drives for row in one.sightings])
@@ -150,7 +149,6 @@ def _scenario_of(drive: RecordedDrive) -> Scenario:
 
 
 def drive_row(found: MappedDrive) -> Row:
-    """Return what a drive has found, for tables."""
     located, drive = found.located, found.located.drive
     states, std = found.states, [car["distance_std_m"] for car in found.sightings if "distance_std_m" in car]
     return {
@@ -179,8 +177,6 @@ _FREE = 0.3  # P(taken) below which scans show a place to be free
 
 @dataclass(frozen=True, eq=False)
 class _Earlier:
-    """The map of earlier drives past the same street."""
-
     lot: ParkingLot | None = None
     frame: LocalFrame | None = None
     tracks: tuple[FloatArray, ...] = ()

@@ -51,7 +51,6 @@ def _pose_errors(result: SessionResult) -> tuple[float, float, float]:
 
 
 def _error_columns(errors: FloatArray) -> tuple[float, ...]:
-    """Return the values of `ERROR_COLUMNS`: medians, except the second."""
     if not len(errors):
         return (float("nan"),) * len(ERROR_COLUMNS)
     middle = np.median(errors, axis=0)

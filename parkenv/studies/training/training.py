@@ -159,7 +159,6 @@ class Training:
 
     @contextmanager
     def watched(self, out: Path, seeds: Sequence[int], progress: Progress) -> Iterator[None]:
-        """Follow the curves that trainings write into a folder, with a bar for each, during a block."""
         over = threading.Event()
 
         def follow() -> None:
@@ -308,7 +307,6 @@ class Training:
         return lines, rows
 
     def test(self, model: Path) -> list[Row]:
-        """Test a model; return a row for each test."""
         with own_thread_and_seeds():
             policy = LearnedAgent(self.sides[0][0], self.spec.algorithm, model).model
             return [
@@ -352,8 +350,6 @@ class Training:
 
 
 class _Evaluator(BaseCallback):  # type: ignore[misc]
-    """Callback that evaluates and saves the model during training."""
-
     def __init__(
         self,
         training: Training,

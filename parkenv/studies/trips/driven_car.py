@@ -60,8 +60,6 @@ class ParkingAttempt(NamedTuple):
 
 
 class TrackPoint(NamedTuple):
-    """Positions of the car and all road users at one time."""
-
     time: float  # s since Monday 00:00
     driven_m: float  # distance driven so far, m
     pose: FloatArray  # (3,) x, y in m, yaw in rad, of the middle of the car's footprint

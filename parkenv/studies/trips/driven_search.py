@@ -122,8 +122,6 @@ class DrivenSearchEnv(SearchEnv):
 
 @dataclass(frozen=True)
 class Trip:
-    """One trip from the entry to the goal."""
-
     seed: int  # seed of the world
     agent: str
     total_s: float  # sum of the next two and of `costs`

@@ -119,7 +119,6 @@ class ManoeuvreStudy(Study):
 
     @cached_property
     def sources(self) -> dict[str, Path | tuple[str, int]]:
-        """The file of each scene, or its level and seed, by name."""
         from parkenv.driving.scene_files import scene_files
 
         if self.cases is not None:

@@ -32,8 +32,6 @@ PLANNER = ParkingAgent.name
 
 @dataclass(frozen=True)
 class ParkingCase:
-    """A distribution of parking tasks on one lot."""
-
     lot: ParkingLot
     kinds: tuple[str, ...] | None = None  # kinds of slots; None for all kinds on the lot
     ways: tuple[str, ...] = ("nose-in", "back-in")  # orientations in perpendicular and oblique slots

@@ -95,7 +95,9 @@ class VehicleController:
         edge = self._lines.edge(source, target, length)
         began, self.car.track = self.car.time, []
         if not self._placed:
-            self._place(edge)
+            pose = self._lines.lines[edge.line].pose(edge.start - self.vehicle.middle)
+            self.car.place(pose, self._on_lane.speed)
+            self._placed = True
         kind = ACROSS
         if not edge.across:
             kind = self._plan_edge(edge)
@@ -141,12 +143,6 @@ class VehicleController:
         return seconds
 
     # --- Lanes
-
-    def _place(self, edge: DrivenEdge) -> None:
-        self.car.place(
-            self._lines.lines[edge.line].pose(edge.start - self.vehicle.middle), self._on_lane.speed
-        )
-        self._placed = True
 
     def _plan_edge(self, edge: DrivenEdge) -> str:
         if self._line == edge.line and self.car.path is not None and not self.car.path.done:
@@ -261,7 +257,10 @@ class VehicleController:
         """Drive to the target with the fastest path; return its name, and the reason of a failure."""
         ways = list(targets)
         for _ in range(_MOST_PLANS):
-            paths = {way: path for way in ways if (path := self._planned_to(targets[way], there)) is not None}
+            obstacles = there.corners, there.n_corners, self.car.pose
+            goals = {way: self.vehicle.at_rear_axle(targets[way]) for way in ways}
+            planned = {way: plan_path(self.vehicle, *obstacles, goal) for way, goal in goals.items()}
+            paths = {way: path for way, path in planned.items() if path is not None}
             if not paths:
                 return ways[0] if len(ways) == 1 else "", NO_WAY
             way = min(paths, key=lambda w: _seconds_of(paths[w]))
@@ -289,10 +288,6 @@ class VehicleController:
             return bool(shapely.intersects(shapely.polygons(corners), body).any())
 
         return notices
-
-    def _planned_to(self, target: FloatArray, there: Obstacles) -> CarPath | None:
-        goal = self.vehicle.at_rear_axle(target)
-        return plan_path(self.vehicle, there.corners, there.n_corners, self.car.pose, goal)
 
     def _back(self, slot: int) -> float:
         """Drive back onto the slot's lane or the previous one, whichever is faster; return `onward_m`."""
@@ -378,5 +373,4 @@ def _away(a: FloatArray, b: FloatArray) -> float:
 
 
 def _askew(a: FloatArray, b: FloatArray) -> float:
-    """Return the angle between two headings, rad."""
     return abs(math.remainder(float(a[2] - b[2]), 2.0 * math.pi))
