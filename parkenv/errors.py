@@ -93,8 +93,8 @@ def require_one_of(name: str, value: object, known: Collection[object]) -> None:
         raise InputError(f"{name} is {value!r:.60}, want one of {', '.join(map(str, known)) or 'none'}")
 
 
+# Options of `reset` that wrappers of other libraries take for themselves and pass on.
 _FOREIGN_OPTIONS = ("minari_autoseed",)
-"""Options of `reset` that wrappers of other libraries take for themselves and pass on."""
 
 
 def reset_options(options: object, known: Collection[str]) -> dict[str, Any]:

@@ -426,8 +426,7 @@ def _copies(of_agents: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-raw_env, parallel_env = LotEnv, LotParallelEnv
-"""The AEC form without wrappers, and the parallel form."""
+raw_env, parallel_env = LotEnv, LotParallelEnv  # the AEC form without wrappers, and the parallel form
 
 
 def env(**options: Any) -> wrappers.OrderEnforcingWrapper[str, Observation, Any]:

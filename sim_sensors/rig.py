@@ -18,8 +18,8 @@ from sim_sensors.laser.scanner import LaserScanner
 
 RIGHT, LEFT = -math.pi / 2, math.pi / 2
 EYE_M = 1.3  # m, height of the rigs' cameras
+# The rigs' camera: wide enough to see parked cars completely from 1.5 m in front of them.
 WIDE = PinholeCamera.from_field_of_view(horizontal=math.pi / 2)
-"""The rigs' camera: wide enough to see parked cars completely from 1.5 m in front of them."""
 
 
 class Sensed(Drawable, Protocol):

@@ -17,8 +17,8 @@ LINE_M = 0.10  # width of painted slot lines
 LIBRARY_MODELS = 100  # number of vehicle models from which cars are drawn
 PAVED_MARGIN_M = 7.0
 KERB_ROOM_M = 0.1  # m by which a kerbside slot must be wider than its car
+# m; least distance between a car and the closed end of its slot, where another row may begin.
 NOSE_GAP_M = 0.05
-"""m; least distance between a car and the closed end of its slot, where another row may begin."""
 
 
 @dataclass(frozen=True)

@@ -28,14 +28,14 @@ from parkenv.compiled.jit import compiled
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import DayError
 
+# Hypotheses with less weight are left out of a plan; they return if observations speak for them.
 NEGLIGIBLE = 5e-4
-"""Hypotheses with less weight are left out of a plan; they return if observations speak for them."""
+# Numbers of levels and slopes. Searches take as long with 21 levels, within noise, and 1 % longer with five.
 LEVELS, SLOPES = 9, 5
-"""Numbers of levels and slopes. Searches take as long with 21 levels, within noise, and 1 % longer with five."""
+# Largest value and degrees of freedom of the t-distribution of levels and slopes, before it is scaled.
 REACH, FREEDOM = 4.2, 4.0
-"""Largest value and degrees of freedom of the t-distribution of levels and slopes, before it is scaled."""
+# Fractions of the slots, those nearest to the goal, that an event may fill, equally likely.
 EVENT_SHARES = np.array([0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0])
-"""Fractions of the slots, those nearest to the goal, that an event may fill, equally likely."""
 EVENT = 0.08
 """Probability of an event among very many slots.
 
@@ -48,12 +48,10 @@ MEAN_EXCESS, USUAL_EXCESS = 0.09, 0.15
 The excess is exponential: fitted to the weekday mornings of 54 German car parks in 2023, with the mean of the last four
 same weekdays as the forecast. An event that fills more slots that are forecast to be free is the less likely.
 """
-HALF_EVENTS_AT = 40.0
-"""Number of slots with half the events of very many: small lots fill up on usual days."""
-P_TAKEN_AT_EVENT = 0.998
-"""P(taken) of the affected slots, unless the forecast is even higher."""
+HALF_EVENTS_AT = 40.0  # number of slots with half the events of very many: small lots fill up on usual days
+P_TAKEN_AT_EVENT = 0.998  # P(taken) of the affected slots, unless the forecast is even higher
+# Probability that the forecast says nothing about the day: then its level is one of `OTHER_LEVELS`, logits.
 WORTHLESS = 0.004
-"""Probability that the forecast says nothing about the day: then its level is one of `OTHER_LEVELS`, logits."""
 OTHER_LEVELS, OTHER_SLOPES = np.array([-2.0, 0.0, 2.0, 4.0]), np.array([0.0, 2.0, 4.0])
 UNINFORMATIVE_SLOT_PROBABILITY = 0.02
 """Probability that the forecast of a slot says nothing about it: then it is as likely free as taken, on a usual day.

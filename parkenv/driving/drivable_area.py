@@ -16,14 +16,14 @@ from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
 
 ROAD_HALF_WIDTH = 3.0  # from the centre line of a lane without slots to its kerbs, m
+# Limits, m, of half the width of a lane with slots, which extends to the slots' mouths.
 HALF_WIDTHS = (2.0, 4.0)
-"""Limits, m, of half the width of a lane with slots, which extends to the slots' mouths."""
 JOINT = 0.6  # gaps between slots of up to twice this width, m, are paved
 STRAIGHTENED = 0.03  # tolerance, m, for simplifying kerbs
 REACH_M = 25.0  # distance, m along both axes, from the car beyond which obstacles are left out
 OVERHANG_M = 0.25  # distance, m, by which parked cars may protrude from their slots at the mouth
+# Slots up to which the whole paved area is computed at once; the union of a town takes ten seconds.
 JOINED_WHOLE = 2000
-"""Slots up to which the whole paved area is computed at once; the union of a town takes ten seconds."""
 
 
 class DrivableArea:

@@ -12,8 +12,8 @@ from parkenv.errors import InputError
 from parkenv.world.drive_graph import LANE_OFFSET, NODE_TOLERANCE
 from parkenv.world.lot import ParkingLot
 
+# Offset of a car from the centre of a two-way lane, m: less than that of the graph's vertices, for right turns.
 KEPT_RIGHT_M = 1.0
-"""Offset of a car from the centre of a two-way lane, m: less than that of the graph's vertices, for right turns."""
 
 _ON_LINE = 0.05  # m
 _LENGTH_TOLERANCE = 1.0  # m, between the length along a line with bends and that of the edge

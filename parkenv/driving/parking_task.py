@@ -27,10 +27,10 @@ from sim_sensors.surroundings import Surroundings
 KINDS = ("perpendicular", "oblique", "parallel")  # orientation of a slot relative to its lane
 # Orientation of a car in a perpendicular or oblique slot; in a parallel slot it faces the direction of traffic.
 WAYS = ("nose-in", "back-in")
+# Distance, m along both axes, from the slot's centre beyond which obstacles are not part of a task.
 REACH = 30.0
-"""Distance, m along both axes, from the slot's centre beyond which obstacles are not part of a task."""
+# Distance, m along both axes, from the slot's centre beyond which the car has left the area of its task.
 AREA = REACH - 3.0
-"""Distance, m along both axes, from the slot's centre beyond which the car has left the area of its task."""
 FARTHEST = AREA - 7.0  # greatest `distance` of a start, m
 UPRIGHT = math.radians(75.0)  # least angle between a perpendicular slot and its lane, rad
 

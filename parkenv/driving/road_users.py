@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
 
+# Times, s from now, at which positions are predicted.
 PREDICTION_TIMES_S = np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0])
-"""Times, s from now, at which positions are predicted."""
+# Clearance, m, to road users that move, and to those that stand and wait.
 MOVING_CLEARANCE_M, STANDING_CLEARANCE_M = 0.5, 0.05
-"""Clearance, m, to road users that move, and to those that stand and wait."""
 MOVES = 0.1  # speed, m/s, above which a road user counts as moving
 START_SPEED = 0.7  # speed, m/s, at which a standing car is assumed to start
 
@@ -63,8 +63,8 @@ def encounter_times(
     return when
 
 
+# Times ahead, s, at which road users check their own positions for conflicts with the car.
 LOOK_AHEAD_S = (0.1, 0.6, 1.2)
-"""Times ahead, s, at which road users check their own positions for conflicts with the car."""
 GAP_M = 0.4  # clearance to the car, m
 
 _FAR_M = 12.0

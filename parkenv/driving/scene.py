@@ -22,8 +22,8 @@ from parkenv.errors import InputError
 MAX_DISTANCE_M = 500.0  # greatest distance from start to target, m
 MAX_POINTS = 20_000  # greatest number of points of all obstacles of a scene
 CHECK_M = 0.02  # greatest distance that any point of the car moves between two checked footprints, m
+# How exactly a manoeuvre has to end: ParkBench's tolerances.
 POSITION_TOLERANCE_M, ANGLE_TOLERANCE_RAD = 0.05, 0.01
-"""How exactly a manoeuvre has to end: ParkBench's tolerances."""
 _TOUCHING = 1e-9  # m², overlap of a footprint and a polygon from which on they are in contact
 
 

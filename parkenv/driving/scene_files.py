@@ -20,8 +20,8 @@ from parkenv.errors import InputError, naming, nearest
 from parkenv.files.limited_reading import is_there, parse_json, read_text, read_toml
 from parkenv.files.spec_file import Several, Spec, read_tables
 
+# Suffixes of the files that are read in a folder of scenes.
 SCENE_SUFFIXES = (".csv", ".json", ".toml", ".geojson")
-"""Suffixes of the files that are read in a folder of scenes."""
 PARKBENCH_STEP_M = 0.1  # distance of the points into which ParkBench divides its lines
 
 

@@ -14,8 +14,8 @@ from parkenv.errors import InputError, naming
 from parkenv.files.field_types import Positive, Validated
 
 PHYSICS_S = 0.05  # physics time step, s
+# Columns of a vehicle's state: m, m, rad, m/s, rad, m/s²; x and y are the middle of the rear axle.
 X, Y, YAW, SPEED, STEERING, ACCELERATION = range(6)
-"""Columns of a vehicle's state: m, m, rad, m/s, rad, m/s²; x and y are the middle of the rear axle."""
 STATE_SIZE = 6
 STRAIGHT = 1e-6  # turn per step, rad, below which an arc is approximated by its chord
 
@@ -125,6 +125,8 @@ TPCAP = VehicleParameters(
     length=4.689, width=1.942, wheelbase=2.8, rear_overhang=0.929, max_steering=0.75, steering_rate=0.5,
     max_speed=2.5, max_reverse_speed=2.5, max_acceleration=1.0, max_braking=1.0,
 )  # fmt: skip
+# Cars by name: the default; that of the Trajectory Planning Competition for Automated Parking (2022); and that of the
+# paper on ParkBench (2026, appendix B), without its cut corners and with the speeds and rates of the second.
 VEHICLES = {
     "golf": VehicleParameters(),
     "tpcap": TPCAP,
@@ -132,8 +134,6 @@ VEHICLES = {
         TPCAP, length=4.95, width=2.0, wheelbase=3.0, rear_overhang=1.025, max_steering=math.radians(32.0)
     ),
 }
-"""Cars by name: the default; that of the Trajectory Planning Competition for Automated Parking (2022); and that of the
-paper on ParkBench (2026, appendix B), without its cut corners and with the speeds and rates of the second."""
 
 
 def finite_pose(name: str, given: object) -> FloatArray:

@@ -100,12 +100,12 @@ from parkenv.world.occupancy.decay import decay_factor
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
 from parkenv.world.scenario import EDGE
 
+# Why `advance_at` returned, if not for a car to decide: all searches are over; the time limit; more SEARCH records
+# are needed; Python must compute the forecast of the car `pending`; a compiled policy chose an unknown action; more
+# room for reports is needed; Python must reserve slots; more room for the steps that are kept is needed.
 (
     FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS, NEEDS_STEPS,
 ) = range(-1, -9, -1)  # fmt: skip
-"""Why `advance_at` returned, if not for a car to decide: all searches are over; the time limit; more SEARCH records are
-needed; Python must compute the forecast of the car `pending`; a compiled policy chose an unknown action; more room for
-reports is needed; Python must reserve slots; more room for the steps that are kept is needed."""
 
 _MANY_STEPS = 64  # cars on their way, from which on their data does not stay in the cache
 _SEARCH_AT = int(CAR.fields["search"][1])  # type: ignore[index]

@@ -20,12 +20,12 @@ from parkenv.world.occupancy.process import ArrivalDay
 from parkenv.world.scenario import Drivers, Scenario, drive_times
 from parkenv.world.week import DAY_S
 
+# Chance that a free slot was taken when a car came that is parked at first: it stands in the first slot that was not.
+# A counted facility that has room had room.
 _TAKEN_BEFORE = 0.8
-"""Chance that a free slot was taken when a car came that is parked at first: it stands in the first slot that was not.
-A counted facility that has room had room."""
 _MOST_PASSED = 30
+# Options that are times, s, and fields of the FLEET record.
 TIMES = ("tick_s", "delay_s", "manoeuvre_s")
-"""Options that are times, s, and fields of the FLEET record."""
 
 
 @dataclass(frozen=True)

@@ -77,8 +77,8 @@ from parkenv.world.occupancy.kernel import (
 )
 from parkenv.world.week import DAY_S
 
+# Names of the numbers that a step returns; metrics are those of the episode so far.
 STEP_RESULT = ("reward", *REWARD_TERMS, *METRICS, "over", "vertex")
-"""Names of the numbers that a step returns; metrics are those of the episode so far."""
 
 
 def read_step(scenario_index: int, result: tuple[Any, ...]) -> tuple[float, bool, int, dict[str, Any]]:

@@ -79,10 +79,8 @@ from parkenv.world.scenario import SearchProblem
 
 MINUTE = 60.0
 MANY_SLOTS = 20.0
-NEAR_SLOTS = 5
-"""Default number of slots described."""
-MAX_SLOTS = 1_000
-"""Maximum number of slots in an observation."""
+NEAR_SLOTS = 5  # default number of slots described
+MAX_SLOTS = 1_000  # maximum number of slots in an observation
 N_MOVES = len(MOVES)
 HERE, PER_MOVE, PER_NEAR = 14, 8, 8
 FIRST_NEAR = HERE + N_MOVES * PER_MOVE

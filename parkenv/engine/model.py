@@ -63,8 +63,7 @@ from parkenv.world.occupancy.process import MAX_RATE, OccupancyProcess
 from parkenv.world.scenario import Scenario, SearchProblem
 from parkenv.world.week import WEEK_HOURS
 
-MAX_STEPS = 2000
-"""Steps after which `Simulations.run` ends a search, as environments do."""
+MAX_STEPS = 2000  # steps after which `Simulations.run` ends a search, as environments do
 _LEVELS, _SLOPES = 33, 9  # cells of the day's level and slope
 _REACH = 3.5  # standard deviations that they span, on either side
 _LEAST_RATE = 1e-9  # 1/s, of slots that never change

@@ -42,11 +42,12 @@ from parkenv.errors import InputError, require_one_of
 from parkenv.world.occupancy.kernel import inlined, kernel
 from parkenv.world.scenario import SearchProblem
 
+# Weights, (n_outputs, n_inputs), and biases, (n_outputs,), of a layer, as in PyTorch.
 Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Weights, (n_outputs, n_inputs), and biases, (n_outputs,), of a layer, as in PyTorch."""
 ACTIVATIONS = ("tanh", "relu")
 TANH, RELU = range(2)
 
+# Addresses of the arrays of `Surroundings`, and their lengths.
 SURROUNDINGS = np.dtype(
     [
         *((name, ADDRESS) for name in Surroundings._fields),
@@ -54,8 +55,8 @@ SURROUNDINGS = np.dtype(
     ],
     align=True,
 )  # fmt: skip
-"""Addresses of the arrays of `Surroundings`, and their lengths."""
 
+# A policy network that observes `local` and `action_mask`.
 NETWORK = np.dtype(
     [
         # The SURROUNDINGS record, and room for an observation, (width,) float32.
@@ -76,7 +77,6 @@ NETWORK = np.dtype(
     ],
     align=True,
 )
-"""A policy network that observes `local` and `action_mask`."""
 
 surroundings_at, network_at = record_at(SURROUNDINGS), record_at(NETWORK)
 

@@ -41,8 +41,8 @@ from parkenv.world.occupancy.kernel import inlined
 from parkenv.world.scenario import SearchProblem
 
 LEAVE = -1  # action of compiled policies: give up and park elsewhere
+# Action of compiled policies: `TAKE_SLOT + slot` attempts to park there at once, without the drive.
 TAKE_SLOT = 16
-"""Action of compiled policies: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
 
 
 class PolicyData:

@@ -21,8 +21,7 @@ N_REGIONS = 4
 N_TERMS = len(COST_TERMS)
 
 
-Value = Callable[[Any], Any]
-"""Function of a `SearchProblem` or `Scenario` that gives the value of a field."""
+Value = Callable[[Any], Any]  # function of a `SearchProblem` or `Scenario` that gives the value of a field
 PROBLEM_FIELDS: tuple[tuple[str, Any, Value], ...] = (
     ("n_slots", np.int64, lambda problem: problem.lot.n_slots),
     ("n_vertices", np.int64, lambda problem: problem.lot.n_vertices),
@@ -75,18 +74,18 @@ HIDDEN_FIELDS: tuple[tuple[str, Any, Value], ...] = (
 # For PROCESS_KIND, a PROCESS record; for LOG_KIND, RECORDED_DAY records, one for each of `weekdays`; for SHARED_KIND,
 # the SHARED_WORLD record; 0 if Python makes the world of every search.
 _MODELS = [("world_kind", np.int64), ("world", ADDRESS), ("prior_kind", np.int64), ("prior", ADDRESS)]
+# The constant part of the searches in a scenario; [type] in the tables above stands for the address of an array.
 SCENARIO = np.dtype(
     [(name, ADDRESS if isinstance(of, list) else of) for name, of, _ in (*PROBLEM_FIELDS, *HIDDEN_FIELDS)]
     + _MODELS,
     align=True,
 )
-"""The constant part of the searches in a scenario; [type] in the tables above stands for the address of an array."""
+# Fields of a SCENARIO record that hold addresses.
 ADDRESSES = (
     *(name for name, of, _ in (*PROBLEM_FIELDS, *HIDDEN_FIELDS) if isinstance(of, list)),
     "world",
     "prior",
 )
-"""Fields of a SCENARIO record that hold addresses."""
 
 _SUMS = [
     *((name, np.float64) for name in COST_FIELDS),  # costs over the episode, s
@@ -97,8 +96,7 @@ _SUMS = [
     ("slots_passed", np.int64),
     ("n_steps", np.int64),
 ]
-STEP_FIELDS = tuple(f"step_{name}" for name in COST_FIELDS)
-"""Fields of the costs of the last step."""
+STEP_FIELDS = tuple(f"step_{name}" for name in COST_FIELDS)  # fields of the costs of the last step
 _PROGRESS = [
     *_SUMS,
     *((name, np.float64) for name in STEP_FIELDS),
@@ -129,12 +127,12 @@ _EPISODES = [
     ("clock", np.float32, (2,)),  # time, and time since the search began, as observed
 ]
 
+# Fields of a SEARCH record that a search changes.
 PROGRESS_FIELDS = tuple(str(entry[0]) for entry in _PROGRESS + _EPISODES)
-"""Fields of a SEARCH record that a search changes."""
+# Its further fields, besides sizes and addresses.
 OPTION_FIELDS = (
     "n_scenarios", "chosen_scenario", "chosen_entry", "chosen_day", "chosen_second", "car", "reserved", "walks",
 )  # fmt: skip
-"""Its further fields, besides sizes and addresses."""
 
 
 def _with_costs(fields: Sequence[Any], **arrays: str) -> np.dtype[Any]:
@@ -152,6 +150,7 @@ def _with_costs(fields: Sequence[Any], **arrays: str) -> np.dtype[Any]:
     return np.dtype(layout, align=True)  # type: ignore[call-overload, no-any-return]
 
 
+# A running search; `costs` and `step_costs` are its costs by term, (N_TERMS,).
 SEARCH = _with_costs(
     [
         *_PROGRESS,
@@ -190,12 +189,12 @@ SEARCH = _with_costs(
     costs=COST_FIELDS[0],
     step_costs=STEP_FIELDS[0],
 )
-"""A running search; `costs` and `step_costs` are its costs by term, (N_TERMS,)."""
 
+# `reserved` of a search for which a guidance system has no slot, and of one without a guidance system.
 NO_SLOT, UNGUIDED = -1, -2
-"""`reserved` of a search for which a guidance system has no slot, and of one without a guidance system."""
 SENTINEL = 0  # column shared by all slots without their own: they were not observed
 
+# A slot with a column: true state as in CURSOR, and the search's observations of it.
 SLOT = np.dtype(
     [
         ("observed", np.bool_),
@@ -206,16 +205,16 @@ SLOT = np.dtype(
     ],
     align=True,
 )
-"""A slot with a column: true state as in CURSOR, and the search's observations of it."""
 
+# What the last observation of a slot has left: the excess of `belief.cue_belief`, its time, s, P(taken), and what was
+# observed: the logarithm of P(it | about to leave) / P(it | not).
 CUE = np.dtype([(name, np.float64) for name in ("excess", "at", "p", "evidence")], align=True)
-"""What the last observation of a slot has left: the excess of `belief.cue_belief`, its time, s, P(taken), and what was
-observed: the logarithm of P(it | about to leave) / P(it | not)."""
 
+# Slots from which the tables of a fleet's searches take memory only where they are written.
 SPARSE_SLOTS = 4096
-"""Slots from which the tables of a fleet's searches take memory only where they are written."""
 BLOCK_BITS = 3
 BLOCK_SIZE = 1 << BLOCK_BITS
+# The belief in 8 slots: a few vector instructions update it, and the data of a search stay close together.
 BLOCK = np.dtype(
     [
         ("prior", np.float64, (BLOCK_SIZE,)),  # forecast P(taken)
@@ -226,7 +225,6 @@ BLOCK = np.dtype(
     ],
     align=True,
 )
-"""The belief in 8 slots: a few vector instructions update it, and the data of a search stay close together."""
 
 FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)  # the parts of the observation's `belief`
 NEVER_OBSERVED = -1.0  # `observed_at` of a slot not observed in this search
@@ -268,6 +266,7 @@ SHARED_SLOT = np.dtype(
     align=True,
 )
 
+# A counted facility.
 COUNTED = np.dtype(
     [
         ("capacity", np.int64),  # number of cars that fit
@@ -281,21 +280,21 @@ COUNTED = np.dtype(
     ],
     align=True,
 )
-"""A counted facility."""
 
 # ---- cars, and their world
 
 STATES = ("due", "searching", "parked", "left", "gave_up", "balked", "truncated")
+# States of a car: not yet arrived; searching; parked; has left its slot; went elsewhere because the lot was proven
+# full; went elsewhere because its patience was at an end; ended by the limit of steps.
 DUE, SEARCHING, PARKED, LEFT, GAVE_UP, BALKED, TRUNCATED = range(7)
-"""States of a car: not yet arrived; searching; parked; has left its slot; went elsewhere because the lot was proven
-full; went elsewhere because its patience was at an end; ended by the limit of steps."""
 
+# What a car knows of the slots: its own observations; also those on the live map; the slot that the guidance system
+# has reserved for it; the true state of every slot.
 OWN_KNOWLEDGE, SHARED_KNOWLEDGE, RESERVE_KNOWLEDGE, FULL_KNOWLEDGE = (
     KNOWLEDGE.index(name) for name in ("own", "shared", "reserve", "full")
 )
-"""What a car knows of the slots: its own observations; also those on the live map; the slot that the guidance system
-has reserved for it; the true state of every slot."""
 
+# A car of the fleet; `costs` are its costs by term, (N_TERMS,).
 CAR = _with_costs(
     [
         ("scenario_index", np.int64),  # index of the scenario (goal)
@@ -332,7 +331,6 @@ CAR = _with_costs(
     ],
     costs=COST_FIELDS[0],
 )
-"""A car of the fleet; `costs` are its costs by term, (N_TERMS,)."""
 
 _REPORTED = [
     ("time", np.float64),  # of the last report, before all others without one
@@ -341,12 +339,11 @@ _REPORTED = [
     ("false_alarm_rate", np.float64),
     ("p", np.float64),  # P(taken) then
 ]
-LIVE_SLOT = np.dtype(_REPORTED, align=True)
-"""A slot on the live map."""
+LIVE_SLOT = np.dtype(_REPORTED, align=True)  # A slot on the live map
 
-REPORT = np.dtype([("slot", np.int64), *_REPORTED], align=True)
-"""A report for the live map."""
+REPORT = np.dtype([("slot", np.int64), *_REPORTED], align=True)  # A report for the live map
 
+# A step of a car, but for the last one, which parks it. A car that does not act at its end waits in a queue.
 STEP = np.dtype(
     [
         ("car", np.int64),
@@ -358,8 +355,8 @@ STEP = np.dtype(
     ],
     align=True,
 )
-"""A step of a car, but for the last one, which parks it. A car that does not act at its end waits in a queue."""
 
+# A world with many cars; `arrival` is when it begins.
 FLEET = np.dtype(
     [
         *SHARED_WORLD_FIELDS,
@@ -416,7 +413,6 @@ FLEET = np.dtype(
     ],
     align=True,
 )
-"""A world with many cars; `arrival` is when it begins."""
 
 scenario_at, search_at, edge_at = record_at(SCENARIO), record_at(SEARCH), record_at(EDGE)
 slot_at, block_at, cue_at = record_at(SLOT), record_at(BLOCK), record_at(CUE)

@@ -39,15 +39,14 @@ from parkenv.world.occupancy.process import Arrival, CompiledModel, PriorModel, 
 from parkenv.world.scenario import Scenario, SearchProblem
 from parkenv.world.week import DAY_S, WEEK_S
 
+# Names of the options of `reset` that say how an episode begins.
 START_OPTIONS = ("scenario", "entry", "arrival")
-"""Names of the options of `reset` that say how an episode begins."""
-DENSE_SLOTS = 2**24
-"""Slots of all searches up to which their tables, a gigabyte then, are in large pages."""
+DENSE_SLOTS = 2**24  # slots of all searches up to which their tables, a gigabyte then, are in large pages
+# Attributes of `Searches` with a row for each search; the SEARCH field of the name holds the row's address.
 _ARRAYS = (
     "slots", "blocks", "columns", "external_forecast", "day_error", "p_occupied", "belief", "step_observed",
     "cue_table", "cues",
 )  # fmt: skip
-"""Attributes of `Searches` with a row for each search; the SEARCH field of the name holds the row's address."""
 
 
 class ScenarioRecords:

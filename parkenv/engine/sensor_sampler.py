@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
 
+# px; width of the pictures of a searching car's cameras. Those of a survey are 640 px wide.
 PICTURE_WIDTH = 400
-"""px; width of the pictures of a searching car's cameras. Those of a survey are 640 px wide."""
 
 _SEEDS = 1 << 31
 

@@ -18,8 +18,8 @@ from parkenv.world.scenario import SearchProblem
 from parkenv.world.week import DAY_S
 
 LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
+# What a search may observe; see `parkenv.envs.search.SearchEnv`.
 OBSERVATIONS = ("full", "occupancy", "local")
-"""What a search may observe; see `parkenv.envs.search.SearchEnv`."""
 BELIEF_PARTS = ("belief", "step_observed", "cues")  # what `occupancy` leaves out of `full`
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
 _CUE_PARTS = [(-1.0, 1.0), (0.0, MAX_DECAY_RATE), (-MOST_EVIDENCE, MOST_EVIDENCE)]

@@ -44,8 +44,7 @@ CONTROL_S = SUBSTEPS * PHYSICS_S  # control period, s
 CONTACT_COST = 200.0  # default cost of a contact, s: more than any drive within the step limit
 REWARD_TERMS = ("reward_time", "reward_approach", "reward_contact")
 LEFT_AREA = "left the area"
-CONTACTS = ("", *(kind.label for kind in ObstacleKind if kind), LEFT_AREA)
-"""What `info["contact"]` numbers."""
+CONTACTS = ("", *(kind.label for kind in ObstacleKind if kind), LEFT_AREA)  # what `info["contact"]` numbers
 
 
 class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):

@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import gymnasium as gym
 
+# Of `gymnasium.make("parkenv/Search-v2", ...)`, besides the scenario.
 OPTIONS = {"observation": "local", "flat": True, "reward_scale": 0.01}
-"""Of `gymnasium.make("parkenv/Search-v2", ...)`, besides the scenario."""
 
 LOTS = ["campus", "jam", "street", "mini", "kerbs"]
 for _name, _scenario in [*zip(LOTS, LOTS, strict=True), ("all", LOTS)]:

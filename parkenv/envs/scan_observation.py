@@ -30,10 +30,8 @@ from parkenv.engine.records import N_ACTIONS
 from parkenv.envs.sensors import SearchSensorsEnv, sensor_key
 from parkenv.errors import require_whole
 
-SCANS = 4
-"""Default number of scans in an observation."""
-MAX_SCANS = 100
-"""Maximum number of scans in an observation."""
+SCANS = 4  # default number of scans in an observation
+MAX_SCANS = 100  # maximum number of scans in an observation
 WAVELENGTHS_M = (8.0, 16.0, 32.0, 64.0, 128.0, 512.0)
 SECTORS = 72
 FIXED = 6 + 4 * len(WAVELENGTHS_M)

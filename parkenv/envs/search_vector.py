@@ -38,8 +38,7 @@ from parkenv.world.occupancy.process import raise_error
 if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
 
-MAX_ENVS = 1_000_000
-"""Maximum number of environments."""
+MAX_ENVS = 1_000_000  # maximum number of environments
 # Gymnasium's names of the masks that say which searches have a metric.
 _WHICH = tuple(f"_{name}" for name in (*REWARD_TERMS, *METRICS, "scenario_index"))
 # Types and places of the metrics and the step's terms in a SEARCH record.

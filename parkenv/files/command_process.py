@@ -37,8 +37,8 @@ def _end(number: int, frame: FrameType | None) -> None:
     os._exit(128 + number)
 
 
+# Files that libraries read in the working folder when they are imported: numba's sets where compiled code is kept.
 _SETTINGS = {".numba_config.yaml": "numba", "matplotlibrc": "matplotlib"}
-"""Files that libraries read in the working folder when they are imported: numba's sets where compiled code is kept."""
 
 
 def distrust_working_folder() -> None:

@@ -12,8 +12,8 @@ from parkenv.files.limited_reading import csv_records
 
 MAX_NUMBER = 1e12  # maximum absolute value of a number; sums and squares of larger ones could overflow
 _MAX_DIGITS = 15
+# Texts that begin with one of these run as formulas in spreadsheets; an apostrophe before it prevents that.
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""Texts that begin with one of these run as formulas in spreadsheets; an apostrophe before it prevents that."""
 
 
 class Kind(NamedTuple):

@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+# Maximum length of a name in UTF-8; most file systems take 255, and temporary files need some.
 MAX_BYTES = 180
-"""Maximum length of a name in UTF-8; most file systems take 255, and temporary files need some."""
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _FORBIDDEN = re.compile(r'[<>:"/\\|?*]|^[. ]+|[. ]+$|^(?=(con|prn|aux|nul|com\d|lpt\d)(\.|$))', re.IGNORECASE)
 

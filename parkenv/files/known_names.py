@@ -10,34 +10,34 @@ LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")  # suffixes of lot files
 SensorModelName = Literal["perfect", "blind", "laser", "stereo"]
 SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)
 RigName = Literal["laser", "stereo", "both_sides", "camera"]
+# Packaged detectors: hog has both HOG models, side and front; net is a network in parkenv/perception/models.
 DETECTORS = ("hog", "net", "side", "front")
-"""Packaged detectors: hog has both HOG models, side and front; net is a network in parkenv/perception/models."""
 DETECTOR_SUFFIXES = (".npz", ".onnx")
 WeatherName = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
 LocaliserName = Literal["none", "scan-matching"]
+# What corrects the pose of a survey's car; see `parkenv.mapping.scan_matching`.
 LOCALISERS: tuple[LocaliserName, ...] = get_args(LocaliserName)
-"""What corrects the pose of a survey's car; see `parkenv.mapping.scan_matching`."""
 MapName = Literal["empty", "right", "wrong"]  # maps that a commute starts from
+# What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`.
 KnowledgeName = Literal["own", "shared", "reserve", "full"]
-"""What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`."""
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
 UNBEATEN = ("oracle", "bound")  # agents that compete with no other: they know what others do not
+# Levels of drawn scenes with a kind of slot each, the easiest first; see `parkenv.driving.levels`.
 SCENE_LEVELS = tuple(
     f"{kind}-{level}"
     for level in ("normal", "complex", "extreme", "moving")
     for kind in ("perpendicular", "oblique", "parallel")
 )
-"""Levels of drawn scenes with a kind of slot each, the easiest first; see `parkenv.driving.levels`."""
 MAX_CARS = 1_000_000  # maximum number of cars of a world
 BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
+# Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`.
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
-"""Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`."""
+# When the states of a log of looks change; see `parkenv.world.occupancy.recorded`.
 Changes = Literal["midway", "drawn"]
 CHANGES: tuple[Changes, ...] = get_args(Changes)
-"""When the states of a log of looks change; see `parkenv.world.occupancy.recorded`."""
+# Mapping of a log whose slots have the names of the lot's, or of counts by the names of its facilities or zones.
 SAME_SLOTS = "same"
-"""Mapping of a log whose slots have the names of the lot's, or of counts by the names of its facilities or zones."""
+# Whether the agent of a driven trip observes slots from the lane.
 OBSERVED, UNOBSERVED = "observed", "unobserved"
-"""Whether the agent of a driven trip observes slots from the lane."""

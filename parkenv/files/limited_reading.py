@@ -31,11 +31,11 @@ from pydantic_core import from_json
 from parkenv.errors import InputError, naming, with_extra
 from parkenv.files.atomic_write import write_text
 
+# Maximum size of a file, if its reader sets no other; 64 MB of JSON become at most about 1.5 GB in memory.
 MAX_BYTES = 64_000_000
-"""Maximum size of a file, if its reader sets no other; 64 MB of JSON become at most about 1.5 GB in memory."""
 MAX_SPEC_BYTES = 1_000_000  # maximum size of TOML and YAML, which hold no data and are read slowly
+# Maximum nesting of tables and lists in TOML and YAML; JSON may have 200 levels, the limit of its parser.
 MAX_DEPTH = 100
-"""Maximum nesting of tables and lists in TOML and YAML; JSON may have 200 levels, the limit of its parser."""
 _HUGE = re.compile(rb"[eE]\+?\d{3}")
 _LONG_NUMBER = re.compile(rb"[0-9]{301,}")
 # tomllib takes cubic time for a key of many parts.

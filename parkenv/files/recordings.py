@@ -22,20 +22,20 @@ from parkenv.files.images import decode_image
 from parkenv.files.limited_reading import Counted, read_yaml, require_file
 from parkenv.files.videos import USUAL_FPS, VideoFrame
 
+# Selects columns that take no room in the file, whatever they hold: generated ones, and those of virtual tables.
 _COMPUTED = """
 SELECT of.name, "column".name FROM sqlite_master AS of, pragma_table_xinfo(of.name) AS "column"
 WHERE of.type = 'table' AND "column".hidden
 """
-"""Selects columns that take no room in the file, whatever they hold: generated ones, and those of virtual tables."""
 
 Messages = Callable[[set[str]], Iterator[tuple[str, int, Any]]]
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 MAX_PART_BYTES = 256_000_000  # maximum size of a chunk or a message, unpacked
+# Maximum size, unpacked, of chunks that overlap in time, which are read at the same time.
 MAX_MERGED_BYTES = 1_000_000_000
-"""Maximum size, unpacked, of chunks that overlap in time, which are read at the same time."""
+# Maximum size of a packed file of a rosbag, unpacked, as a multiple of its own size, beside 1 MB.
 MAX_GROWTH = 100
-"""Maximum size of a packed file of a rosbag, unpacked, as a multiple of its own size, beside 1 MB."""
 _NO_PICTURE = re.compile(r"(?i)16|32|64|mono16|bayer|h26|hevc|av1|vp9")  # depth, colour mosaics, films
 _OTHER_PICTURES = re.compile(r"(?i)image|video|packet")  # in names of types of other transports of pictures
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"

@@ -23,8 +23,8 @@ _TABLE = (
     "CREATE TABLE row (name TEXT NOT NULL, key TEXT NOT NULL, value TEXT NOT NULL, crc32 INTEGER NOT NULL, "
     "PRIMARY KEY (name, key)) STRICT"
 )
+# Begins a journal of SQLite's; at its end, the magic follows the name of a file that SQLite removes in the end.
 _JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")
-"""Begins a journal of SQLite's; at its end, the magic follows the name of a file that SQLite removes in the end."""
 
 Row = dict[str, Any]
 

@@ -29,6 +29,7 @@ from parkenv.files.limited_reading import MAX_SPEC_BYTES, is_there, read_json, r
 _SHOWN = 60
 _FOLDER = "folder"
 
+# What is wanted, by pydantic's error type; other types keep pydantic's message.
 _WANTED = {
     "greater_than": "a number above {gt}",
     "greater_than_equal": "a number of at least {ge}",
@@ -50,7 +51,6 @@ _WANTED = {
     "too_short": "at least {min_length} values",
     "too_long": "at most {max_length} values",
 }
-"""What is wanted, by pydantic's error type; other types keep pydantic's message."""
 
 T = TypeVar("T")
 
@@ -65,8 +65,8 @@ def resolved_path(value: object, info: ValidationInfo) -> object:
     return path
 
 
+# An existing file; paths are relative to the folder of the file that names them.
 FilePath = Annotated[Path, BeforeValidator(resolved_path)]
-"""An existing file; paths are relative to the folder of the file that names them."""
 
 
 def _detector(value: object, info: ValidationInfo) -> object:
@@ -86,10 +86,10 @@ def _packaged(value: str) -> str:
     return value
 
 
+# A packaged detector, a file (.npz, .onnx) or `MODULE:CLASS`; paths are relative to the folder of the file.
 DetectorName = Annotated[str, BeforeValidator(_detector)]
-"""A packaged detector, a file (.npz, .onnx) or `MODULE:CLASS`; paths are relative to the folder of the file."""
+# A packaged detector or a file.
 PackagedDetector = Annotated[str, BeforeValidator(_detector), AfterValidator(_packaged)]
-"""A packaged detector or a file."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +120,10 @@ def _different(values: tuple[T, ...]) -> tuple[T, ...]:
     return values
 
 
+# The values of one axis of a grid: at least one, without duplicates.
 Axis = Annotated[
     tuple[T, ...], Strict(False), Field(min_length=1, max_length=10_000), AfterValidator(_different)
 ]
-"""The values of one axis of a grid: at least one, without duplicates."""
 
 
 class Spec(BaseModel):

@@ -19,8 +19,8 @@ _WEEK_S = 604_800  # smaller times are since Monday 00:00
 _UNIX_S = (1e8, 9e9)  # 1973 to 2255; nanoseconds fit 64 bits
 _DECIMAL = re.compile(r"\d+\.\d+")
 _STEP_M = 1.0  # between the positions of which a heading is made
+# A gap in a track is longer than this, s, and than this multiple of the median time between two points.
 _GAP_S, _GAP_STEPS = 2.0, 3.0
-"""A gap in a track is longer than this, s, and than this multiple of the median time between two points."""
 _SEGMENT = ("track_fid", "track_seg_id", "segment")  # columns that say where a track is interrupted
 _WANT = "want columns time or file, x and y (m) or lat and lon (degrees), and yaw (rad) or heading (degrees) if known"
 

@@ -20,12 +20,11 @@ from parkenv.errors import InputError, naming
 from parkenv.files.limited_reading import csv_rows
 from parkenv.files.option import columns_in
 
-MAX_COUNT_BYTES = 512_000_000
-"""Maximum size of a file of counts, unpacked."""
-MAX_NAME = 200
-"""Maximum length of a car park's name, characters."""
-MAX_DAYS = 400_000
-"""Maximum number of car parks times days of a file of counts."""
+MAX_COUNT_BYTES = 512_000_000  # maximum size of a file of counts, unpacked
+MAX_NAME = 200  # maximum length of a car park's name, characters
+MAX_DAYS = 400_000  # maximum number of car parks times days of a file of counts
+# Names of each kind of column, in lower case and with `_` for other characters than letters. A car park has the first
+# of its names.
 NAMES = {
     "car_park": "car_park carpark parkhaus parkplatz parking blockface kerb facility block group name",
     "capacity": "capacity kapazität kapazitaet stellplätze stellplaetze plätze plaetze spaces",
@@ -37,25 +36,20 @@ NAMES = {
     "date": "date datum tag",
     "time": "time zeit uhrzeit datetime timestamp zeitpunkt zeitstempel datum_zeit datum_uhrzeit",
 }
-"""Names of each kind of column, in lower case and with `_` for other characters than letters. A car park has the first
-of its names.
-"""
-LARGEST = "largest"
-"""Stands for a capacity: the largest count of the car park."""
+LARGEST = "largest"  # stands for a capacity: the largest count of the car park
+# Kinds of columns that say when a reading was taken, one of them in a table; a date may stand beside it.
 TIMES = ("hour", "hour_utc", "time", "time_utc")
-"""Kinds of columns that say when a reading was taken, one of them in a table; a date may stand beside it."""
+# Texts of readings without a value, as empty ones.
 UNKNOWN = ("-", "--", "?", "k.a.", "k. a.", "n/a", "na", "null", "none")
-"""Texts of readings without a value, as empty ones."""
 _FORMATS = ("%d.%m.%Y %H:%M", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M", "%Y/%m/%d %H:%M:%S", "%Y-%m-%d %H:%M")
 _AN_INSTANT = timedelta(microseconds=1)
 HOURS, HOUR_S, DAY_S = 24, 3600.0, 86_400.0
 FIRST_DAY = date(2000, 1, 1).toordinal()
-FINE = 1.5
-"""Readings in an hour from which on a table has several an hour: they are used all."""
+FINE = 1.5  # readings in an hour from which on a table has several an hour: they are used all
 
 
+# Places of the only car park, a table of car parks and their capacities, or `LARGEST`; None: those of the table.
 Capacity = float | Path | str | None
-"""Places of the only car park, a table of car parks and their capacities, or `LARGEST`; None: those of the table."""
 
 
 class Readings(NamedTuple):

@@ -48,8 +48,8 @@ _WINDOW = 28  # days
 _REPEATS_PRIOR = (2.0, 4.0)  # repeats of readings, and pairs, assumed before any is seen
 
 
+# Readings an hour that say something of their own: cars stay for longer than the quarter of an hour between them.
 _MOST_PER_HOUR = 4.0
-"""Readings an hour that say something of their own: cars stay for longer than the quarter of an hour between them."""
 
 
 class Moments(NamedTuple):

@@ -319,8 +319,7 @@ def fit_settings(counts: Counts, before: int, on_step: Callable[[], None] | None
     return best
 
 
-FIT_STEPS = 30
-"""Number of calls of `on_step` in a fit."""
+FIT_STEPS = 30  # number of calls of `on_step` in a fit
 
 
 def forecast_days(

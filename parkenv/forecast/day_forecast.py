@@ -25,14 +25,12 @@ from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.forecast.count_table import HOURS
 from parkenv.forecast.counts import Counts
 
+# Degrees of freedom of the t distributions: days that nothing announces are far off more often than normal ones.
 FREEDOM = 6.0
-"""Degrees of freedom of the t distributions: days that nothing announces are far off more often than normal ones."""
-INTERVAL = (0.05, 0.95)
-"""Quantiles of the 90 % intervals."""
+INTERVAL = (0.05, 0.95)  # quantiles of the 90 % intervals
 DIAGONAL = np.arange(HOURS)
 _N_DRAWS = 128
-MIN_HOURS = 12
-"""Observed hours that a day needs for its mean to count."""
+MIN_HOURS = 12  # observed hours that a day needs for its mean to count
 _BANDS = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95])
 _MISSES = 1.0 - (INTERVAL[1] - INTERVAL[0])
 _STEP_CAR_PARK, _STEP_BAND = 0.03, 0.05

@@ -42,8 +42,8 @@ from parkenv.forecast.count_table import (
 from parkenv.forecast.count_table import NAMES as COUNT_NAMES
 
 MAX_STATE_S = 72 * HOUR_S
-BEFORE_S = 900.0
-"""How long before `since` the other state is taken to have held, s."""
+BEFORE_S = 900.0  # how long before `since` the other state is taken to have held, s
+# Names of each kind of column, the better ones first, as in `count_table`; `_utc` behind one says that it is UTC.
 NAMES = {
     "bay": "bay slot_id bay_id bayid slot space_id spaceid kerbside_id kerbsideid marker_id street_marker streetmarker "
     "st_marker_id device_id deviceid meter_id sensor_id space",
@@ -55,7 +55,6 @@ NAMES = {
     "state": "state occupied status occupancy occupancy_state occupancystate status_description vehicle_present "
     "vehiclepresent taken",
 }
-"""Names of each kind of column, the better ones first, as in `count_table`; `_utc` behind one says that it is UTC."""
 _STATES = dict.fromkeys(
     ["1", "1.0", "true", "yes", "occupied", "taken", "present", "parked", "belegt"], True
 ) | dict.fromkeys(

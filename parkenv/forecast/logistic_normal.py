@@ -38,5 +38,4 @@ class NormalQuadrature(NamedTuple):
         return p, slope
 
 
-EVEN = NormalQuadrature.evenly(0.375, 6.0)
-"""Nodes of forecasts that trips correct."""
+EVEN = NormalQuadrature.evenly(0.375, 6.0)  # nodes of forecasts that trips correct

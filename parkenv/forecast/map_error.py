@@ -27,12 +27,10 @@ from parkenv.files.field_types import NotNegative, NumberOrInf, Positive, Valida
 from parkenv.forecast.logistic_normal import EVEN
 
 HOURS = 24
-N_HOUR_KNOTS = 2 * HOURS
-"""Parts of g: the hours of a weekday, then those of a weekend day."""
+N_HOUR_KNOTS = 2 * HOURS  # parts of g: the hours of a weekday, then those of a weekend day
+# Length scales of the smooth part, in units of nearness (-1 to 1), and of g, in hours.
 SMOOTH_REACH, HOUR_REACH = 0.3, 2.0
-"""Length scales of the smooth part, in units of nearness (-1 to 1), and of g, in hours."""
-NEGLIGIBLE = 1e-6
-"""Priors with less weight are dropped."""
+NEGLIGIBLE = 1e-6  # priors with less weight are dropped
 SWEEPS = 3  # of expectation propagation; further ones change logits by less than 0.01
 UPDATES = 32  # of a covariance at once
 

@@ -25,11 +25,9 @@ from parkenv.forecast.day_forecast import (
     quantiles_of_t,
 )
 
-BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
-"""Bands of fullness."""
+BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)  # bands of fullness
 
-Band = dict[str, float | int | None]
-"""A band of fullness: from, to, days, coverage_90."""
+Band = dict[str, float | int | None]  # A band of fullness: from, to, days, coverage_90
 
 _WEEK = 7  # days
 

@@ -31,8 +31,7 @@ from scipy.special import expit
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.forecast.logistic_normal import NormalQuadrature
 
-MAX_DAYS = 60
-"""Days to fit a forecast to, those nearest in time: others say little more."""
+MAX_DAYS = 60  # days to fit a forecast to, those nearest in time: others say little more
 
 _HOURS, _WEEKDAYS = 24.0, 7
 # Hyperparameters: standard deviations of the day's level, of the part that is the same at all hours and of the rest,

@@ -11,12 +11,9 @@ from scipy.special import expit, logit
 from parkenv.compiled.arrays import FloatArray
 from parkenv.forecast.counts import Counts
 
-LEVEL_SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
-"""Shares of all car parks whose levels are reported."""
-LEAST_READINGS = 20
-"""Number of readings below which an hour of the week has no mean."""
-BY_DAY = slice(8, 20)
-"""Hours that the level of a car park, or of a day, is measured by."""
+LEVEL_SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # shares of all car parks whose levels are reported
+LEAST_READINGS = 20  # number of readings below which an hour of the week has no mean
+BY_DAY = slice(8, 20)  # hours that the level of a car park, or of a day, is measured by
 WORKDAYS = 5
 _CLIP = 0.005  # a mean of exactly 0 or 1 has no logit
 _ITERATIONS = 50

@@ -70,14 +70,14 @@ def read_provenance(path: Path) -> Provenance | None:
 
 
 UNREACHED = "slots that cannot be reached from an entry"  # a reason for leaving out
+# Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres.
 NEAR_ON_GLOBE = 1.0
-"""Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres."""
 
+# Fields that a draft and its lot have in common.
 _SHARED = (
     "name", "slot_ids", "lanes", "entries", "goals", "walls", "facilities", "zone_rules", "goal_weights",
     "entry_weights", "turns", "left_hand",
 )  # fmt: skip
-"""Fields that a draft and its lot have in common."""
 
 
 @dataclass(frozen=True)

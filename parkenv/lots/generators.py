@@ -18,10 +18,10 @@ BAY_SIZE = (5.0, 2.5)  # length and width, m, of a perpendicular or angled slot
 KERB_SIZE = (6.0, 2.1)  # length and width, m, of a kerbside slot
 TWO_WAY_HALF_WIDTH = 3.0  # distance from the centre line of a two-way street to its parked cars, m
 ONE_WAY_HALF_WIDTH = 2.0  # distance from the centre line of a one-way street to its parked cars, m
+# Distance from the centre of a crossing to the first parked car, m: no parking within 5 m of the kerbs' corner.
 CROSSING_CLEARANCE = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 5.0
-"""Distance from the centre of a crossing to the first parked car, m: no parking within 5 m of the kerbs' corner."""
+# Distance from the centre line of a street to the buildings, m: half the street, parked cars and a footway.
 BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
-"""Distance from the centre line of a street to the buildings, m: half the street, parked cars and a footway."""
 
 
 @dataclass(frozen=True, eq=False)

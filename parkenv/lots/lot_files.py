@@ -70,8 +70,8 @@ def load_lot(name_or_path: str | Path) -> ParkingLot:
     return read_lot(path)
 
 
+# Folder with 24 real car parks, © OpenStreetMap contributors, ODbL (see its README).
 PLACES = Path(__file__).parent / "places"
-"""Folder with 24 real car parks, © OpenStreetMap contributors, ODbL (see its README)."""
 
 
 def packaged_lot(name: str) -> ParkingLot:
@@ -244,10 +244,10 @@ def _lot(document: Any) -> ParkingLot:
     )
 
 
+# Distance, m: a lane that ends closer to another one without a common point was probably meant to join it.
 LANE_GAP = 1.0
-"""Distance, m: a lane that ends closer to another one without a common point was probably meant to join it."""
+# Smallest depth, m, of a reported overlap of two slots; smaller ones are drawing inaccuracies.
 SLOT_OVERLAP = 0.1
-"""Smallest depth, m, of a reported overlap of two slots; smaller ones are drawing inaccuracies."""
 GOAL_REACH = 50.0  # distance, m, from the nearest lane beyond which a goal is reported
 
 

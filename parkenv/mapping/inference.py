@@ -13,10 +13,10 @@ from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.week import DAY_S, HOUR_S
 
+# Prior weights, in sessions, of the slot's mean and of the lot's mean at the same hour.
 SLOT_WEIGHT, LOT_WEIGHT = 4.0, 6.0
-"""Prior weights, in sessions, of the slot's mean and of the lot's mean at the same hour."""
+# Default decay time of an observation, s: 1/(λ+μ) for a mean stay and a mean vacancy of one hour each.
 RELAXATION_S = 1800.0
-"""Default decay time of an observation, s: 1/(λ+μ) for a mean stay and a mean vacancy of one hour each."""
 OTHER_WEEKDAY = 0.85
 """Weight of a session on another day of the same kind (weekday or weekend).
 

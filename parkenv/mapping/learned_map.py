@@ -19,14 +19,14 @@ from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_S
 
 MOST_SLOTS = 3_000  # largest lot: memory and time grow with the square of the slots
+# Largest lot whose survey sessions, which observe every slot, are learned from; that takes a second a session.
 MOST_SURVEYED_SLOTS = 1_000
-"""Largest lot whose survey sessions, which observe every slot, are learned from; that takes a second a session."""
 SURVEY_ERROR = 0.03  # share of the slots that a survey session judges wrong
+# Day error of a map that states none: the median of 99 car parks over two years is 0.77 logits.
 USUAL_DAY = DayError(0.8)
-"""Day error of a map that states none: the median of 99 car parks over two years is 0.77 logits."""
 _MEMORY = (30.0, 365.0)  # days, time constants of the drift
+# Standard deviations, relative to that of the level.
 _SHAPE = {"level": 1.0, "slope": 0.8, "smooth": 0.8, "own": 0.6, "hour": 0.5}
-"""Standard deviations, relative to that of the level."""
 
 
 def _priors(
@@ -40,11 +40,11 @@ def _priors(
     )
 
 
+# Priors for a given map: right, a little off, quite wrong, or worthless; with or without drift over weeks.
 GIVEN_MAP = (*_priors({0.1: 0.3, 0.5: 0.3, 1.0: 0.25, 2.5: 0.15}), *_priors({2.0: 0.002}, trust=0.0))
-"""Priors for a given map: right, a little off, quite wrong, or worthless; with or without drift over weeks."""
 NO_MAP = _priors({1.0: 0.5, 2.0: 0.5})  # priors for a lot of which nothing is known
+# Priors for a lot of which survey sessions alone are known; unlike a driver's trips, they are spread over the day.
 SURVEYED = _priors({1.0: 0.5, 2.0: 0.5}, shape={**_SHAPE, "hour": 1.0})
-"""Priors for a lot of which survey sessions alone are known; unlike a driver's trips, they are spread over the day."""
 
 
 class EmptyMap(PriorModel):

@@ -17,8 +17,8 @@ from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.arrival_window import DAY_NAMES
 from parkenv.world.week import DAY_S
 
+# Grey values of cells; with `_YAML`'s thresholds, a map server reads each as what it is.
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254
-"""Grey values of cells; with `_YAML`'s thresholds, a map server reads each as what it is."""
 _IS_OCCUPIED = 0.65  # P(occupied) of occupied cells; free ones are below a half
 _YAML = """image: {image}
 mode: trinary

@@ -62,8 +62,8 @@ class _Fit(NamedTuple):
     weight: FloatArray
 
 
+# A pose, or what `PerceptionPipeline.process` asks for it.
 Located = FloatArray | Callable[[Sequence[RangeScan]], FloatArray]
-"""A pose, or what `PerceptionPipeline.process` asks for it."""
 
 
 def make_locate(name: str, lot: ParkingLot | None) -> Callable[[FloatArray], Located]:

@@ -21,8 +21,8 @@ from parkenv.mapping.discovery import discover
 from parkenv.perception.box_fit import CAR_LENGTH
 from parkenv.world.lot import Mouth
 
+# What a slot is known from: a car of a row. Guesses are those from cars that are seen once or alone, and from gaps.
 CAR, ONCE, LONE_CAR, GAP = "car", "car seen once", "lone car", "gap"
-"""What a slot is known from: a car of a row. Guesses are those from cars that are seen once or alone, and from gaps."""
 SIDE = (5.2, 2.0)  # length and width, m, of a slot along the kerb
 END = (5.0, 2.5)  # the same of one across or at an angle
 GAP_M = 5.4  # m, room between two cars along the kerb that one more needs

@@ -16,10 +16,10 @@ from sim_sensors.scene import Scene
 
 MATCH = 0.3  # intersection over union from which a detection matches a car
 CLEAR = 0.6  # visible fraction of a car in an image from which a frame without its detection counts as a miss
+# m, from the camera to a car's centre: upper ends of the bins in which detections are counted.
 DISTANCE_ENDS = (4.0, 6.0, 8.0, 10.0, 12.0, 15.0)
-"""m, from the camera to a car's centre: upper ends of the bins in which detections are counted."""
+# Localisation methods: `localize_cars`, and the median range as in the thesis (`localize_as_thesis`).
 METHODS = ("fitted", "thesis")
-"""Localisation methods: `localize_cars`, and the median range as in the thesis (`localize_as_thesis`)."""
 _GLIMPSE = 0.05  # visible fraction from which a box can match a car
 _TRUTH = LaserScanner()
 _LEAST_BEAMS = 3

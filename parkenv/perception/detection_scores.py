@@ -18,17 +18,17 @@ from parkenv.perception.car_model import CarModel
 from parkenv.perception.detector import Detections, Detector
 from parkenv.perception.hog_detector import END_WIDEST, HogDetector
 
+# Semi-axes of the ellipse around a true box, as fractions of its width and height (README of the UIUC set).
 REACH = 0.25
-"""Semi-axes of the ellipse around a true box, as fractions of its width and height (README of the UIUC set)."""
+# Number of blocks of consecutive crops; images of the same car are neighbours and should share a block.
 BLOCKS = 30
-"""Number of blocks of consecutive crops; images of the same car are neighbours and should share a block."""
+# Range of searched sizes relative to UIUC's 100×40 box; all cars of the single-scale set have the same size, those of
+# the multi-scale set are 0.89 to 2.12 times as large.
 _SIZES = {"single": (0.85, 1.2), "multi": (0.8, 2.6)}
-"""Range of searched sizes relative to UIUC's 100×40 box; all cars of the single-scale set have the same size, those of
-the multi-scale set are 0.89 to 2.12 times as large."""
 _TOLERANCE = 1.25  # of these sizes, for detectors
 _CROP_RATES = (0.01, 0.1)  # of false positives
+# Farthest a box's centre may be from its crop's, and least width, as fractions of the crop's sides.
 _CROP_MIDDLE, _CROP_WIDTH = 0.19, 0.45
-"""Farthest a box's centre may be from its crop's, and least width, as fractions of the crop's sides."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from sim_sensors.ground_truth import View
 
 Float = TypeVar("Float", np.float32, np.float64)
 
+# Least probability of the boxes that a detector should return. The pipeline keeps a box below `PROBABILITY` only if
+# the range measurements in it fit a car on the ground.
 LEAST_PROBABILITY = 0.08
-"""Least probability of the boxes that a detector should return. The pipeline keeps a box below `PROBABILITY` only if
-the range measurements in it fit a car on the ground."""
 PROBABILITY = 0.25  # least probability of a detection that no range measurements confirm
 
 

@@ -14,8 +14,8 @@ from parkenv.perception.detector import LEAST_PROBABILITY, Detector
 from parkenv.perception.hog_detector import HogDetector
 from parkenv.perception.onnx_detector import OnnxDetector, sidecar_of
 
+# Folder of the packaged models: NAME.npz of a HOG model, NAME.onnx with NAME.toml of a network.
 MODELS = resources.files("parkenv.perception") / "models"
-"""Folder of the packaged models: NAME.npz of a HOG model, NAME.onnx with NAME.toml of a network."""
 DEFAULT_DETECTOR = "hog"  # both packaged models, `side` and `front`
 
 

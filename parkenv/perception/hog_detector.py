@@ -23,8 +23,8 @@ from parkenv.perception.hog import CELL, Descriptor, correlate
 
 END_BELOW = 1.8  # width over height of a box below which it shows a front or rear
 END_WIDEST = 2.0  # width over height of a box that is too wide for the whole front or rear of a car
+# Least probability of a detection that counts in an evaluation: curves go on to many false positives.
 LEAST_SCORED = 0.002
-"""Least probability of a detection that counts in an evaluation: curves go on to many false positives."""
 _ZOOM = 1.6
 _MOST_WINDOWS = 2000  # only the best are kept; a useful model does not report more
 

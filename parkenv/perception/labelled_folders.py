@@ -22,8 +22,8 @@ from parkenv.perception.training import cut_out
 
 Box = tuple[float, float, float, float]
 
+# Names of classes that count as cars: whatever takes a slot.
 CAR_NAMES = ("car", "cars", "van", "truck", "bus", "pickup", "suv", "vehicle", "automobile", "motor vehicle")
-"""Names of classes that count as cars: whatever takes a slot."""
 LEAST_WIDTH = 36  # least width of a car that is trained on, px
 LEAST_CARS = 20
 _WINDOWS = 3  # windows without cars from each picture

@@ -25,8 +25,8 @@ from parkenv.perception.detector import LEAST_PROBABILITY, Detections
 from parkenv.perception.hog_detector import END, END_BELOW, END_WIDEST, SIDE, as_grey, best_boxes
 
 MAX_ONNX_BYTES = 256_000_000  # maximum size of an ONNX file
+# Maximum time and address space of the process that tries an unknown network; Windows knows no such limit.
 LONGEST_S, MOST_BYTES = 120, 8 << 30
-"""Maximum time and address space of the process that tries an unknown network; Windows knows no such limit."""
 _INPUT_PATTERN = r"<Input> CV_32F\w* \[(\d+ x \d+ x \d+ x \d+)\]"
 _TRIAL = f"""
 try:

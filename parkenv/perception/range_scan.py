@@ -17,8 +17,8 @@ from sim_sensors.camera.models import StereoCamera, StereoFrame
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount
 
+# Least and largest range of stereo measurements, m: between them, half a pixel of disparity corresponds to 1 m.
 STEREO_RANGE = 12.0, 25.0
-"""Least and largest range of stereo measurements, m: between them, half a pixel of disparity corresponds to 1 m."""
 _NEAREST = 1.0  # m, the shortest depth that the matcher searches
 _BAND = (0.35, 1.1)  # m above ground: bumpers and doors, below the windows
 _LEAST_PIXELS = 6

@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     from parkenv.world.occupancy.arrival_window import ArrivalWindow
     from parkenv.world.occupancy.log import OccupancyLog, RecordedFile
 
+# Default driving speeds: in a car park (the thesis's), and in a town, whose junctions are part of the mean.
 LOT_KMH, TOWN_KMH = 10.0, 20.0
-"""Default driving speeds: in a car park (the thesis's), and in a town, whose junctions are part of the mean."""
 MIN_PAST_DAYS = 2  # days of counts that a forecast needs at least
 ScenarioSource = str | Path | Mapping[str, Any] | ScenarioSpec | ParkingLot | Scenario
 ScenarioSources = ScenarioSource | Sequence[ScenarioSource]

@@ -13,8 +13,8 @@ from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 
 BLIND = "-blind"  # suffix of the names of these scenarios
+# A curriculum begins with this share of the scenarios, and has all of them after this share of the training.
 FIRST_SHARE, ALL_AT = 0.1, 0.5
-"""A curriculum begins with this share of the scenarios, and has all of them after this share of the training."""
 
 
 def scenario_of_episode(seed: int, episode: int, n: int) -> int:

@@ -608,13 +608,13 @@ def _name(value: str) -> str:
 
 MAX_RATE = 1e6  # maximum number of cars an hour
 Rate = Annotated[float, Field(ge=0.0, le=MAX_RATE)]
+# Of each hour of the day; a number is that of all.
 Rates = Annotated[
     Several[Rate],
     Field(min_length=DAY_HOURS, max_length=DAY_HOURS),
     BeforeValidator(lambda value: [value] * DAY_HOURS if isinstance(value, int | float) else value),
     OrText("number"),
 ]
-"""Of each hour of the day; a number is that of all."""
 Weights = Several[Annotated[float, Field(ge=0.0, le=1e12)]]
 
 
@@ -698,8 +698,8 @@ class ZoneSpec(Spec):
         return replace(zone, **own)
 
 
+# Tables of a scenario of which each value may be another one than the base's; others are replaced whole.
 _MERGED = ("arrivals", "costs", "demand", "speeds", "zones")
-"""Tables of a scenario of which each value may be another one than the base's; others are replaced whole."""
 
 
 def _merged(base: object, value: object) -> object:

@@ -27,12 +27,9 @@ Second = Annotated[NotNegative, Field(lt=DAY_S)]
 _RARE = 1e-12  # probability of more arrivals than `PoissonArrivals.max_cars`
 _FOLLOWED_S = 300.0  # between the moments at which a lot is compared with its occupancy model
 _NO_RATE = 1e-9  # cars an hour
-STAYS_H = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0, 24.0)
-"""Mean stays that are tried to follow counts, h."""
-STAY_CV = 1.0
-"""Standard deviation of these stays over their mean."""
-TOLERANCE = 0.005
-"""Share of the places by which the fit may be off in the mean, for a longer stay."""
+STAYS_H = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0, 24.0)  # mean stays that are tried to follow counts, h
+STAY_CV = 1.0  # standard deviation of these stays over their mean
+TOLERANCE = 0.005  # share of the places by which the fit may be off in the mean, for a longer stay
 
 
 class Arrivals(ABC):

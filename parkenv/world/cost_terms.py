@@ -20,6 +20,7 @@ class CostTerm(NamedTuple):
     optional: bool = False  # whether pictures and tables leave it out where it is 0 everywhere
 
 
+# All terms, in the order in which they are added up.
 COST_TERMS = (
     CostTerm("drive", "drive_s", "drive", "Time driving, waits included", "#0072b2", "#3b9bdc"),
     CostTerm(
@@ -34,11 +35,10 @@ COST_TERMS = (
         "#8c8c8c", "#8f959b", optional=True,
     ),
 )  # fmt: skip
-"""All terms, in the order in which they are added up."""
 
+# Keys of the parts of a step's reward in `info`; they add up to it.
 REWARD_TERMS = tuple(f"reward_{term.name}" for term in COST_TERMS)
-"""Keys of the parts of a step's reward in `info`; they add up to it."""
+# Keys of the sums over an episode; they add up to `total_s`.
 COST_FIELDS = tuple(term.field for term in COST_TERMS)
-"""Keys of the sums over an episode; they add up to `total_s`."""
+# Keys of the metrics of an episode so far in `info`.
 METRICS = (*COST_FIELDS, "total_s", "driven_m", "walked_m", "failed_parks", "slots_passed", "parked")
-"""Keys of the metrics of an episode so far in `info`."""

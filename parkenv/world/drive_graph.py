@@ -24,23 +24,23 @@ from scipy.spatial import cKDTree
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
 
+# Distance, m, of a slot's vertex from the centre line of a two-way lane, to the right of travel.
 LANE_OFFSET = 1.5
-"""Distance, m, of a slot's vertex from the centre line of a two-way lane, to the right of travel."""
 SLOT_REACH = 8.0  # greatest distance, m, of a slot's mouth from the centre line of its lane
 ENTRY_REACH = 15.0  # greatest distance, m, of an entry from a lane
+# Least distance, m, between two slot vertices of one chain, so that every move takes time.
 VERTEX_SPACING = 1.0
-"""Least distance, m, between two slot vertices of one chain, so that every move takes time."""
 CROSSING_REACH = 3.0  # greatest distance, m along the lane, of a move across to a slot on the other side
 NODE_TOLERANCE = 1e-3  # lane points closer than this, m, are one node
 
 
+# Cosine of the largest angle between the point that a turn names and the lane that it means.
 SAME_WAY = np.cos(np.radians(30.0))
-"""Cosine of the largest angle between the point that a turn names and the lane that it means."""
 SAME_NODE = 0.01  # m, between the middle point of a turn and the junction that it means
 
+# Three points of a turn: on the lane by which cars come, the junction, on the lane by which they leave; and whether
+# it is the only one that they may make.
 TurnParts = tuple[FloatArray, bool]
-"""Three points of a turn: on the lane by which cars come, the junction, on the lane by which they leave; and whether it
-is the only one that they may make."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,7 @@ class Centrelines:
         return self.xy[start] + (station - self.station[start])[:, None] * self.leg_tangent[leg]
 
 
-LaneParts = tuple[FloatArray, bool, float]
-"""The points of a lane, whether it is one-way, and its speed."""
+LaneParts = tuple[FloatArray, bool, float]  # the points of a lane, whether it is one-way, and its speed
 
 
 def build_drive_graph(

@@ -13,8 +13,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.files.field_types import NumberOrInf, Numbers, Positive, Validated
 from parkenv.world.week import HOUR_S
 
-QUANTILES = 400
-"""Number of equally probable stays that stand for their law."""
+QUANTILES = 400  # number of equally probable stays that stand for their law
 
 
 class Duration(ABC):

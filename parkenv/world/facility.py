@@ -14,8 +14,8 @@ from parkenv.files.field_types import Name, NotNegative, Number, Validated, Whol
 from parkenv.world.drive_graph import GraphError, GraphProblem, linestrings
 
 FACILITY_KINDS = ("kerb", "lot", "garage")
+# What drivers know of a facility: what they find out by trying; a full sign in view; a live count everywhere.
 KNOWN = ("nothing", "sign", "live")
-"""What drivers know of a facility: what they find out by trying; a full sign in view; a live count everywhere."""
 FACILITY_REACH = 150.0  # greatest distance, m, of a counted facility's point from its lane
 NOMINAL_SLOT = (5.0, 2.5)  # length and width, m, of the one slot that stands for a counted facility
 KERB_DISTANCE = 3.0  # m, from the centre line of the lane to that slot

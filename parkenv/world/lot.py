@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
+# The names of the four columns of `ParkingLot.neighbors`, in order (eq. 3.13).
 MOVES = ("up", "down", "left", "right")
-"""The names of the four columns of `ParkingLot.neighbors`, in order (eq. 3.13)."""
 PARK = len(MOVES)  # the action "park" (eq. 3.14); lower actions are the moves.
 ACTIONS = (*MOVES, "park")
 FARTHEST = 1e8  # largest coordinate, m: enough for any map grid, and small enough for millimetres in float64

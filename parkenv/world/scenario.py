@@ -30,6 +30,7 @@ from parkenv.world.week import HOUR_S
 
 KMH = 1 / 3.6  # 1 km/h in m/s
 
+# Cached properties of a problem that do not depend on its goal.
 _OF_ALL_GOALS = (
     "parking_cost_s",
     "move_s",
@@ -40,7 +41,6 @@ _OF_ALL_GOALS = (
     "sensor_rates",
     "live_drive_s",
 )
-"""Cached properties of a problem that do not depend on its goal."""
 EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
 """Result of an action at a vertex: the vertex that it leads to, s, m.
 

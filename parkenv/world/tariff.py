@@ -20,10 +20,8 @@ from parkenv.errors import InputError, naming, nearest, require, require_number
 from parkenv.files.field_types import Name, NotNegative, Positive, Validated
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_S
 
-NO_ZONE = "other"
-"""Zone of the slots for which a lot names none."""
-PUBLIC = "public"
-"""The class of users that every driver belongs to."""
+NO_ZONE = "other"  # zone of the slots for which a lot names none
+PUBLIC = "public"  # the class of users that every driver belongs to
 VALUE_OF_TIME = 12.0
 """Default value of an hour of a driver's time, in the currency of the prices.
 

@@ -48,8 +48,8 @@ for _material, _row in {
 roughness noise on the albedo, and fraction of the sky light that reaches it (low inside a car)."""
 
 _CODES = np.arange(256) / 255.0
+# (256,) float32, the linear value of every sRGB code.
 LINEAR = np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4).astype(np.float32)
-"""(256,) float32, the linear value of every sRGB code."""
 
 
 class Materials(NamedTuple):

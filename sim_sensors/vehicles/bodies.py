@@ -17,6 +17,8 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.camera.surfaces import ShapeBuilder
 from sim_sensors.vehicles.forms import Form
 
+# Surface types of a vehicle's triangles. Bumpers are painted, or plastic on basic versions; so is the cladding along
+# sills and arches on rugged ones. Bright is chrome, or black.
 Finish = IntEnum(
     "Finish",
     "BODY BODY_DUSTY BODY_DIRTY SEAM GLASS TRIM BUMPER CLADDING GRILLE BRIGHT HEADLAMP REFLECTOR INDICATOR TAIL_LAMP "
@@ -24,8 +26,6 @@ Finish = IntEnum(
     "HANDLE RAIL PILLAR",
     start=0,
 )
-"""Surface types of a vehicle's triangles. Bumpers are painted, or plastic on basic versions; so is the cladding along
-sills and arches on rugged ones. Bright is chrome, or black."""
 N_FINISHES = len(Finish)
 
 # Sections: height between sill (0) and shoulder (1), and the distance (m) of the surface inside the plan.

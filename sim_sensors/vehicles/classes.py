@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 BODIES = ("hatchback", "sedan", "estate", "suv", "van", "pickup")  # body types
 
+# How common each of `BODIES` is in a lot: a European fleet of about 2020, hatchbacks first, SUVs rising.
 BODY_SHARE = (0.37, 0.11, 0.16, 0.24, 0.10, 0.02)
-"""How common each of `BODIES` is in a lot: a European fleet of about 2020, hatchbacks first, SUVs rising."""
 
 
 class SizeClass(NamedTuple):
@@ -36,6 +36,7 @@ class SizeClass(NamedTuple):
     height: tuple[float, float]
 
 
+# Segments of each body.
 SIZE_CLASSES: dict[str, tuple[SizeClass, ...]] = {
     "hatchback": (
         SizeClass("A", 0.20, (3.45, 3.70), (1.60, 1.68), (1.46, 1.54)),  # Fiat 500, VW up!, Kia Picanto
@@ -66,7 +67,6 @@ SIZE_CLASSES: dict[str, tuple[SizeClass, ...]] = {
     ),
     "pickup": (SizeClass("N1", 1.0, (5.20, 5.40), (1.80, 1.92), (1.74, 1.86)),),  # Toyota Hilux, Ford Ranger
 }
-"""Segments of each body."""
 
 
 class Paint(NamedTuple):
@@ -76,6 +76,9 @@ class Paint(NamedTuple):
     spread: tuple[int, int, int]
 
 
+# Shares after Axalta's Global Automotive Color Popularity Report, 2019 to 2021: white, black, grey and silver
+# together near 80 %; in Europe grey 27 % of new cars, black 22 %, blue about 10 %. A fleet is older than what is
+# sold, so some of today's grey is still silver. Colours are sRGB, 0 to 255.
 PAINTS = (
     Paint("white", 0.24, (226, 227, 226), (10, 10, 10)),
     Paint("black", 0.21, (22, 23, 25), (8, 8, 9)),
@@ -88,9 +91,6 @@ PAINTS = (
     Paint("yellow", 0.01, (205, 164, 32), (20, 20, 16)),
     Paint("orange", 0.01, (196, 82, 24), (20, 16, 12)),
 )
-"""Shares after Axalta's Global Automotive Color Popularity Report, 2019 to 2021: white, black, grey and silver
-together near 80 %; in Europe grey 27 % of new cars, black 22 %, blue about 10 %. A fleet is older than what is
-sold, so some of today's grey is still silver. Colours are sRGB, 0 to 255."""
 
 
 def draw_body(rng: np.random.Generator) -> str:

@@ -39,8 +39,8 @@ NEAREST, FARTHEST = (
     (1.5, 2.0),
     SLOT_REACH - 0.2,
 )  # m, from the centre line, of a one-way or a two-way street, to a slot
+# Bays of a row at least, m between neighbours in a row, and mean spacing, m, of a row of slots across the street.
 ROW, APART, ANGLED = 4, 12.0, (2.2, 3.3)
-"""Bays of a row at least, m between neighbours in a row, and mean spacing, m, of a row of slots across the street."""
 SHORTEST = 4.5  # m, shortest slot along a street
 LARGEST = 60.0  # m², largest outline of a bay
 OVERLAP = 0.5  # m, slots that overlap by less are drawn so

@@ -25,6 +25,7 @@ from parkenv.files.limited_reading import csv_records, read_json, unpacked_path
 from parkenv.files.option import columns_in
 from parkenv.lots.formats.geojson import Positions
 
+# Usual names of the columns of each part, without signs, the surest first; of `cars` and `class` all count.
 SYNONYMS = {
     "bay": "bayid bay spaceid meterid meternumber postid markerid stmarkerid kerbsideid block blockid id objectid",
     "lat": "lat latitude y",
@@ -44,13 +45,10 @@ SYNONYMS = {
     "end": "end endtime timerestrictionsfinish",
     "disabled_limit": "disabledlimit disabilityext",
 }
-"""Usual names of the columns of each part, without signs, the surest first; of `cars` and `class` all count."""
 OF_RULES = tuple(SYNONYMS)[7:]
 MOST_BYTES = 256_000_000  # of a register
-Rule = tuple[tuple[str, str], ...]
-"""What a row says of a rule: pairs of one of `OF_RULES` and a text."""
-Box = tuple[tuple[float, float], tuple[float, float]]
-"""Two corners, latitude and longitude."""
+Rule = tuple[tuple[str, str], ...]  # what a row says of a rule: pairs of one of `OF_RULES` and a text
+Box = tuple[tuple[float, float], tuple[float, float]]  # two corners, latitude and longitude
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +118,8 @@ def read_bays(path: str | Path, columns: str | None = None) -> Register:
         return _register(records, own)
 
 
+# The name of a row, its columns, and the geometry of a feature, degrees, or None.
 _Record = tuple[str, dict[str, Any], Any]
-"""The name of a row, its columns, and the geometry of a feature, degrees, or None."""
 
 
 def _records(path: Path) -> Iterator[_Record]:

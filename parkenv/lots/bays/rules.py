@@ -18,6 +18,7 @@ from parkenv.lots.bays.register import Rule
 from parkenv.lots.osm.conditions import always, duration, hours_text
 from parkenv.world.week import DAY_S, HOUR_S
 
+# Words of the values of `access`; the first that fits counts.
 USERS = {
     "no": r"TANS|TOW|CLEARWAY|NO (?:STOPPING|PARKING|STANDING)|NP|NS|S/|TAXI|BUS|MOTOR ?(?:CYCLES?|BIKES?)|BICYCLES?",
     "disabled": r"DIS|DISABLED|HANDICAP\w*|ACCESSIBLE",
@@ -26,7 +27,6 @@ USERS = {
     "permit": r"PERMIT|PP|RESIDENTS?",
     "yes": r"GENERAL|PUBLIC|P?METER\w*|MP?T?R?|PKG|PARKING|STANDARD|REGULAR|TIMED|TICKET|TKT|PAY|PAID|\d*/?\d+P|P",
 }
-"""Words of the values of `access`; the first that fits counts."""
 _PAID = r"MP(?=\d)|MTR|P?METER(?:ED)?|TKT|TICKET|PAY|PAID"
 _STAY = re.compile(r"(?<![\d.:/])(?:(?P<half>1/\d) ?P|(?P<hours>\d+(?:\.\d)?) ?P|\d+ ?(?:M|H)[A-Z]*)\b", re.I)
 _DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")

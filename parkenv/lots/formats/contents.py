@@ -30,6 +30,7 @@ from parkenv.world.facility import Facility
 from parkenv.world.lot import FARTHEST, SLOT_SIDE, Lane, Mouth, ParkingLot, Turn
 from parkenv.world.tariff import NO_ZONE, Hours, Price, Zone, members_of
 
+# The kinds of features, and the geometry types allowed for each.
 KINDS = {
     "slot": ("Polygon",),
     "lane": ("LineString",),
@@ -39,7 +40,6 @@ KINDS = {
     "facility": ("Point",),
     "turn": ("LineString",),
 }
-"""The kinds of features, and the geometry types allowed for each."""
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Side = Annotated[float, Field(ge=SLOT_SIDE, le=FARTHEST)]
 

@@ -336,8 +336,8 @@ def _position(kind: str, position: Any) -> tuple[float, float]:
 if TYPE_CHECKING:
     from pyproj import Transformer
 
+# Extent, degrees, that no outline of parking exceeds (5 km); in metres all are larger than that.
 LARGEST_DEGREES = 0.05
-"""Extent, degrees, that no outline of parking exceeds (5 km); in metres all are larger than that."""
 LONGEST_DEGREES = 1.0  # the same of a map of streets
 _CRS = re.compile(
     r"(?:urn:ogc:def:crs:|https?://www\.opengis\.net/def/crs/)?(EPSG|OGC|ESRI)[:/].*?([A-Za-z0-9]+)"

@@ -17,16 +17,16 @@ from parkenv.world.drive_graph import SLOT_REACH, component_labels
 
 LOOK = 18.0  # how far ahead of a mouth obstacles are looked for, m
 WIDEST_SHARED = 13.0  # widest aisle, m, that two facing rows share
+# Least width, m, of an aisle along kerbside and along perpendicular spaces; oblique ones are in between.
 LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.7, 3.9
-"""Least width, m, of an aisle along kerbside and along perpendicular spaces; oblique ones are in between."""
+# Fraction of that width that is enough before single spaces of an oblique and of a perpendicular row.
 TOLERATED, TOLERATED_ACROSS = 0.75, 0.95
-"""Fraction of that width that is enough before single spaces of an oblique and of a perpendicular row."""
 EXHAUSTIVE = 14  # undecided rows up to which all combinations of sides are tried
 PREFERRED = 0.3  # gain per space of a row that opens to the side that its spaces prefer
 ON_ROAD = 4.0  # gain per space of a row that opens to a road of the map
+# Costs per space of a row that opens to free ground, of a gap as wide as an aisle that nothing opens to, and the gain
+# per space of two rows that share an aisle.
 ALONE, UNUSED, SHARED = 0.55, 0.45, 1.0
-"""Costs per space of a row that opens to free ground, of a gap as wide as an aisle that nothing opens to, and the gain
-per space of two rows that share an aisle."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,12 +44,12 @@ from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Lane, Mouth
 
 LONGEST_CONNECTION = 120.0  # m
+# Least width, m, of a slot across which cars park, and least length of one along which they park.
 NARROWEST, KERB_LENGTH = 1.95, 4.8
-"""Least width, m, of a slot across which cars park, and least length of one along which they park."""
 FACING = 0.5  # least cosine of the angle between a slot's open side and the way to its lane
 CAR_ROOM = 1.0  # half the width, m, that a car needs on a lane
+# Least width, m, of a kerbside slot; narrower outlines are widened towards the lane, since cars stand out of them.
 KERB_WIDTH = 2.0
-"""Least width, m, of a kerbside slot; narrower outlines are widened towards the lane, since cars stand out of them."""
 
 
 @dataclass(frozen=True, eq=False)

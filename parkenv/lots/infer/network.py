@@ -22,8 +22,8 @@ GRID = 0.01  # precision, m, of crossings
 LEAST_DIRECTED = 0.3  # m, least length of a one-way piece
 LOOSE = 1.2  # ends closer to another line than this, m, are moved onto it
 SHORTEST_STUB = 6.0  # dead ends shorter than this, m, are dropped if no space needs them
+# Distance from the junction, m, at which an excess lane joins its neighbour; half the length of a shorter one.
 JOIN_DISTANCE = 4.0
-"""Distance from the junction, m, at which an excess lane joins its neighbour; half the length of a shorter one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +241,8 @@ def _move_lane_end(
 WAY_OUT = 8.0  # length, m, of the road from the edge of the car park to the entry
 LONGEST_WAY_OUT = 30.0  # m, from a lane to the edge
 BEYOND_ENTRY = 12.0  # distance, m, from the entry to the goal that lies on its side
+# Half the width, m, that a way out needs, and half of that of the narrowest.
 CORRIDOR, NARROW_CORRIDOR = 1.5, 1.1
-"""Half the width, m, that a way out needs, and half of that of the narrowest."""
 DEAD_END_GAIN = 15.0  # metres of driving that an aisle's free end is preferred by
 
 
@@ -389,9 +389,9 @@ def _ways_out(
     return ways
 
 
+# Clearance, m, of a wide connection, and the longest drive between the ends of a possible connection without it, as a
+# multiple of its length: of a wide one, of one between ends of aisles, and of any other.
 WIDE, DETOUR_WIDE, DETOUR_ENDS, DETOUR_MIDWAY = 2.2, 1.8, 2.2, 4.0
-"""Clearance, m, of a wide connection, and the longest drive between the ends of a possible connection without it, as a
-multiple of its length: of a wide one, of one between ends of aisles, and of any other."""
 SAMPLE = 1.0  # spacing, m, of the points of an aisle from which connections may start
 NEAR_END = 6.0  # distance, m, from the end of an aisle within which a connection starts at the end
 SHORTEST = 0.3  # m
@@ -505,8 +505,8 @@ def _trace(space: FreeSpace, before: IntArray, cell: int) -> FloatArray:
 LEAST_CLEARANCE = 1.4  # half the width of a one-way road, m
 COMFORTABLE = 2.9  # clearance, m, from which more is worth nothing
 MARGIN = 14.0  # m around the obstacles
+# Sizes of cells, m, and the number of fine cells above which they are coarse.
 FINE, COARSE, FINE_CELLS = 0.7, 1.0, 250_000
-"""Sizes of cells, m, and the number of fine cells above which they are coarse."""
 
 
 class FreeSpace:

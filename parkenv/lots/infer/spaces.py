@@ -146,8 +146,8 @@ def without_overlaps(spaces: Spaces) -> Spaces:
 TOUCHING = 0.7  # widest gap, m, between neighbours in a row
 SAME_AXIS = np.cos(np.radians(25.0))  # least |cosine| of the angle between the axes of neighbours
 STEP = 0.62  # largest offset of neighbours along their axes, as a fraction of their length: 45° rows have 0.5
+# Least ratio of length to width of spaces end to end along a kerb; of just two of them, least length, m, and ratio.
 SLIM, KERB_LENGTH, KERB_SHAPE = 1.6, 4.9, 1.9
-"""Least ratio of length to width of spaces end to end along a kerb; of just two of them, least length, m, and ratio."""
 SQUARE = np.radians(12.0)  # largest deviation from a right angle of a perpendicular row
 RIGHT = np.pi / 2
 
@@ -311,13 +311,13 @@ def _turned(vectors: FloatArray, angle: float) -> FloatArray:
 
 
 SPACING = (1.8, 8.0)  # least and greatest distance, m, from a space to the next in its row
+# Largest distance of neighbours in a row, as a multiple of the nearest neighbour's distance.
 SAME_SPACING = 1.3
-"""Largest distance of neighbours in a row, as a multiple of the nearest neighbour's distance."""
 SAME_WAY = np.radians(15.0)  # largest angle between a space's row and the direction to a neighbour in it
 STRAIGHT = 0.6  # largest distance, m, of a space's centre from the line of a straight row
 SHARPEST = np.radians(30.0)  # largest change of direction from space to space in a curved row
+# Spacing, m, up to which a row without yaw is perpendicular, and from which it is parallel.
 WIDEST_BAY, SHORTEST_KERB = 3.7, 4.8
-"""Spacing, m, up to which a row without yaw is perpendicular, and from which it is parallel."""
 WIDER = 1.25  # from this multiple of the row's spacing on, a space is wider than the others of its row
 ALONG = np.radians(20.0)  # largest angle between a row and cars that park along it
 SAME_ANGLE = 0.95  # least length of the mean direction, as an axis, of the cars in a row

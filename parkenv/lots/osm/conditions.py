@@ -19,10 +19,10 @@ from parkenv.world.tariff import DAYS, PUBLIC, Hours
 from parkenv.world.week import DAY_S, HOUR_S
 
 Tags = Mapping[str, str]
+# A value, and those that replace it at some hours; later ones take precedence.
 Conditional = tuple[str, Sequence[tuple[str, BoolArray]]]
-"""A value, and those that replace it at some hours; later ones take precedence."""
-FORBIDDEN = ""
-"""The class of users of places where nobody may park."""
+FORBIDDEN = ""  # the class of users of places where nobody may park
+# Class of users for each value of `access`, `parking:condition` and `restriction` that not everyone may park by.
 RESERVED = {
     **dict.fromkeys(("loading", "loading_only", "unloading", "delivery"), "delivery"),
     **dict.fromkeys(("charging", "charging_only", "electric", "electric_vehicle"), "charging"),
@@ -32,9 +32,8 @@ RESERVED = {
     **dict.fromkeys(("residents", "resident", "permit", "permit_holders"), "permit"),
     "customers": "customers",
 }  # fmt: skip
-"""Class of users for each value of `access`, `parking:condition` and `restriction` that not everyone may park by."""
+# Classes of users whose places a car park may count apart: `capacity:disabled` and so on.
 RESERVED_PLACES = ("disabled", "charging", "women")
-"""Classes of users whose places a car park may count apart: `capacity:disabled` and so on."""
 NO_PARKING = (
     *("no_parking", "no_stopping", "no_standing", "no_waiting", "fire_lane", "taxi_only", "bus_only", "bus_stop"),
     *("hgv_only", "motorcycle", "motorcycle_only", "bicycle", "taxi", "goods", "coach", *NOT_CARS),
@@ -43,16 +42,15 @@ FOR_ALL = (
     *("yes", "none", "free", "ticket", "disc", "public", "permissive", "designated", "destination", "motorcar"),
     *("fee", "unknown", "limited", "customary", "car", "use_sidepath", "motor_vehicle", ""),
 )  # fmt: skip
-FREE = ("no", "free", "none", "0")
-"""Values of `fee` and `charge` where nothing is charged."""
+FREE = ("no", "free", "none", "0")  # values of `fee` and `charge` where nothing is charged
+# Properties of an ordinary car that conditions may ask for: t, m.
 ORDINARY_CAR = {"weight": 1.5, "maxweight": 1.5, "length": 4.5, "width": 1.8, "height": 1.6, "axles": 2.0}
-"""Properties of an ordinary car that conditions may ask for: t, m."""
 _OTHERS = (
     *("wet", "snow", "winter", "emergency", "agricultural", "forestry", "bicycle", "moped", "trailer", "caravan"),
     *("visitors", "guests", "students", "women", "parents", "doctors", "holders"),
 )  # fmt: skip
+# Mondays of the week that counts and of those that must be like it, in summer and in winter.
 _WEEKS = tuple(datetime(2026, month, day) for month, day in ((6, 8), (6, 1), (11, 2), (11, 9)))
-"""Mondays of the week that counts and of those that must be like it, in summer and in winter."""
 _DAY_NAMES = {
     **{name: DAYS[k] for k, name in enumerate(("mon", "tue", "wed", "thu", "fri", "sat", "sun"))},
     **{f"{name}day": DAYS[k] for k, name in ((0, "mon"), (4, "fri"), (6, "sun"))},
@@ -374,8 +372,8 @@ def duration(text: str) -> float | None:
     return sum(float(n.replace(",", ".")) * _seconds(unit) for n, unit in parts)
 
 
+# Currencies in which an hour costs some units, not thousands.
 SMALL = re.compile(r"€|\$|£|EUR|USD|GBP|CHF|CAD|AUD|NZD|SGD", re.I)
-"""Currencies in which an hour costs some units, not thousands."""
 MOST_PER_HOUR = 1000.0  # a higher charge in one of these is a mistake
 _NUMBER = r"\d{1,9}(?:[.,'’\u00a0\u202f ]\d{3})*(?:[.,]\d{1,4})?"
 _CHARGE = re.compile(

@@ -87,16 +87,16 @@ from parkenv.lots.unread import unread_table
 from parkenv.world.drive_graph import SLOT_REACH, component_labels
 from parkenv.world.lot import Lane
 
+# Values of `parking` for slots that are not in the open at ground level.
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
-"""Values of `parking` for slots that are not in the open at ground level."""
 FARTHEST = 100_000.0  # largest distance of parking and roads from the centre of a map, m
 BLIND = {("noexit", "yes"), ("highway", "turning_circle"), ("highway", "turning_loop")}  # tags of dead ends
 STREETS_AROUND = 60.0  # distance beyond the slots, m, within which streets are lanes if no bounds are given
 NO_AISLE = f"slots that no aisle reaches within {SLOT_REACH:g} m"  # reason for leaving out
+# Sources of slots.
 MAPPED, FILLED, KERBSIDE = "amenity=parking_space", "amenity=parking, rows by rule", "kerbside parking"
-"""Sources of slots."""
+# Largest allowed overlap, m, of slots drawn by hand, and of slots created by rule.
 MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
-"""Largest allowed overlap, m, of slots drawn by hand, and of slots created by rule."""
 
 
 def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
@@ -553,8 +553,8 @@ def _plausibility(outlines: Sequence[FloatArray]) -> tuple[float, float]:
     return float(np.mean(fits)) if fits else 0.0, float(np.median(skew)) if skew else 0.0
 
 
+# Distance, m, between spaces up to which they belong to one car park: a street with verges, or two aisles.
 SAME_CAR_PARK = 22.0
-"""Distance, m, between spaces up to which they belong to one car park: a street with verges, or two aisles."""
 AROUND = 60.0  # distance, m, from the spaces of a car park within which roads and buildings belong to it
 LEAST_SPACES = 10  # number of spaces of the smallest car park, by default
 MOST_IN_TOWN = 300_000  # maximum number of spaces in one file

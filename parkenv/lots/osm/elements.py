@@ -33,17 +33,17 @@ from parkenv.lots.formats.geojson import Positions
 from parkenv.lots.osm.answers import Answer, Location, Member, elements_of_xml, has_geometry, refuse_partial
 from parkenv.lots.osm.export_tags import NESTED, OSM_ID, id_of_feature, tags_of_feature
 
+# Keys that distinguish elements of OpenStreetMap from other GeoJSON.
 MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
-"""Keys that distinguish elements of OpenStreetMap from other GeoJSON."""
+# Keys of the elements that an import reads.
 KEYS = (*MAPPED_KEYS, "noexit", "shop", "office", "craft", "healthcare", "tourism", "leisure")
-"""Keys of the elements that an import reads."""
+# Keys of the nodes that an import reads.
 NODE_KEYS = (*KEYS, "barrier", "motorcar", "motor_vehicle", "vehicle")
-"""Keys of the nodes that an import reads."""
+# Maximum number of nodes, ways and relations of one file: a city of a million people.
 MOST_ELEMENTS = 5_000_000
-"""Maximum number of nodes, ways and relations of one file: a city of a million people."""
 CAR_KEYS = frozenset(("motorcar", "motor_vehicle", "vehicle"))
+# Keys of a restriction of turns that holds for cars, the most specific first.
 TURN_KEYS = (*(f"restriction:{key}" for key in ("motorcar", "motor_vehicle", "vehicle")), "restriction")
-"""Keys of a restriction of turns that holds for cars, the most specific first."""
 _APART = 3e-8  # degrees, some 3 mm: nodes at this distance are not the same
 _SAME = 1e-6  # degrees, some 0.1 m: a cut nearer to a node is at the node
 BEYOND = (np.nan, np.nan)  # position of a node that is not in the file
@@ -176,8 +176,8 @@ class _NoTurnError(Exception):
     """Why a restriction of turns is not read."""
 
 
+# A node: its id, or where it is, degrees, if a file has positions in place of ids.
 Ref = int | tuple[float, float]
-"""A node: its id, or where it is, degrees, if a file has positions in place of ids."""
 
 
 class _Way(NamedTuple):

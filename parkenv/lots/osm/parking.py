@@ -65,12 +65,12 @@ class Arrangement:
         return self.length if self.angle == 0.0 else self.width / float(np.sin(self.angle))
 
 
+# Arrangement for each value of OpenStreetMap's `orientation`; diagonal cars park at 60°.
 ARRANGEMENTS = {
     "parallel": Arrangement(0.0, *KERB_SIZE),
     "diagonal": Arrangement(np.pi / 3, *BAY_SIZE),
     "perpendicular": Arrangement(np.pi / 2, *BAY_SIZE),
 }
-"""Arrangement for each value of OpenStreetMap's `orientation`; diagonal cars park at 60°."""
 DRAWN = 0.05  # tolerance, m, of the length of a row: OpenStreetMap's seven digits round to a centimetre
 
 
@@ -147,14 +147,14 @@ OLD_ORIENTATIONS = {
     **{name: name for name in ARRANGEMENTS},
     **{"inline": "parallel", "orthogonal": "perpendicular", "marked": "parallel", "yes": "parallel"},
 }
+# Distance from the kerbs' corner at a junction, and from a pedestrian crossing, to the first car, m.
 CORNER_CLEARANCE = 5.0
-"""Distance from the kerbs' corner at a junction, and from a pedestrian crossing, to the first car, m."""
 DRIVEWAY_CLEARANCE = 1.0  # distance from the edge of a joining service road to the first car, m
+# Smallest slot length, m, if a tagged capacity needs more slots than fit at the usual length.
 SHORTEST_KERB_SLOT = 5.0
-"""Smallest slot length, m, if a tagged capacity needs more slots than fit at the usual length."""
 ROUNDING = 1e-6  # m, shorter intervals are none
+# Largest angle between an arm and the street at which the arm continues the street.
 STRAIGHT_ON = np.radians(30.0)
-"""Largest angle between an arm and the street at which the arm continues the street."""
 
 
 @dataclass(frozen=True)
@@ -357,8 +357,8 @@ class Junctions:
 
 
 OUTLINE_TOLERANCE = 0.4  # largest overhang, m, of a slot beyond the outline: the accuracy of mapped outlines
+# Trial offsets of a row along its aisle, as fractions of a slot's width; the one with the most slots is used.
 PHASES = (0.0, 0.25, 0.5, 0.75)
-"""Trial offsets of a row along its aisle, as fractions of a slot's width; the one with the most slots is used."""
 CORRIDOR = 0.8  # fraction of a road's half width that must be clear of slots of other roads
 
 
@@ -450,8 +450,8 @@ def _fitting(
 ENTRANCE_REACH = 100.0  # largest distance, m, from the nearest slot of a building entrance that is a goal
 BUILDING_REACH = 200.0  # the same for the nearest building if there is no entrance
 NOT_GOALS = ("no", "garage", "emergency", "exit", "service")  # values of `entrance` that are not goals
+# Values of `building` that are not goals.
 NOT_WALKED_TO = ("garage", "garages", "carport", "roof", "shed", "parking", "hut", "no", "transformer_tower")
-"""Values of `building` that are not goals."""
 
 
 class CrossedOutlineError(InputError):
@@ -564,10 +564,10 @@ def _distance_to_slots(slots: Slots, geometries: NDArray[np.object_]) -> FloatAr
     return result
 
 
+# Values of `parking_space` that any car may use.
 CAR_SPACES = ("normal", "yes", "car", "parent", "parents", "women", "woman", "customers", "residents")
-"""Values of `parking_space` that any car may use."""
+# Largest area of a slot, m²; a larger space without a capacity counts as several and is left out.
 LARGEST_SPACE = 30.0
-"""Largest area of a slot, m²; a larger space without a capacity counts as several and is left out."""
 
 
 def is_space(element: OsmElement) -> bool:

@@ -31,6 +31,7 @@ from parkenv.world.drive_graph import (
 )
 from parkenv.world.lot import Lane, Turn
 
+# Carriageway width, m, without parked cars, of two-way roads without the tags `width` and `lanes`.
 STREET_WIDTH = {
     "motorway": 7.5,
     "trunk": 7.5,
@@ -43,7 +44,7 @@ STREET_WIDTH = {
     "living_street": 5.0,
     "service": 5.0,
 }
-"""Carriageway width, m, without parked cars, of two-way roads without the tags `width` and `lanes`."""
+# Speed limit, km/h, of roads without the tag `maxspeed`, by class.
 LIMITS = {
     **dict.fromkeys(("primary", "secondary", "tertiary", "unclassified", "road"), 50.0),
     "motorway": 100.0,
@@ -52,21 +53,20 @@ LIMITS = {
     "living_street": 10.0,
     "service": 15.0,
 }
-"""Speed limit, km/h, of roads without the tag `maxspeed`, by class."""
 _AISLE_LIMIT = 10.0  # km/h, of a `service=parking_aisle`
 _NAMED_LIMITS = {"walk": 7.0, "none": 100.0, "urban": 50.0, "rural": 70.0, "living_street": 7.0}
 AISLE_WIDTH = 6.0  # the same for a `service=parking_aisle`
 LANE_WIDTH = 3.0  # width of each of the tagged `lanes`, m
+# Values of `barrier` that let cars pass unless access tags say otherwise.
 PASSABLE = (
     *("no", "entrance", "cattle_grid", "toll_booth", "border_control", "checkpoint", "sally_port", "coupure"),
     *("height_restrictor", "width_restrictor", "arch", "bump_gate"),
 )
-"""Values of `barrier` that let cars pass unless access tags say otherwise."""
+# Barriers that let cars pass on service roads if no tag says otherwise: ticket gates, or open by day.
 ASSUMED_OPEN = ("lift_gate", "gate", "swing_gate")
-"""Barriers that let cars pass on service roads if no tag says otherwise: ticket gates, or open by day."""
 BARRIER_GAP = 1.5  # m, between a barrier and the roads that end before it
+# Kinds of `highway=service` that are not lanes.
 NOT_FOR_PARKING = ("drive-through", "emergency_access", "bus")
-"""Kinds of `highway=service` that are not lanes."""
 
 
 class Rank(IntEnum):
@@ -250,13 +250,12 @@ def _assumed_open(tags: Mapping[str, str]) -> bool:
     return tags.get("barrier") in ASSUMED_OPEN and not closed_to_cars(tags) and tags.get("locked") != "yes"
 
 
-ACCESS = ("motorcar", "motor_vehicle", "vehicle", "access")
-"""Keys of access, the most specific first."""
+ACCESS = ("motorcar", "motor_vehicle", "vehicle", "access")  # keys of access, the most specific first
+# Values of access, and keys whose value `only` says the same, that let no ordinary car in.
 NOT_CARS = (
     *("no", "agricultural", "forestry", "military", "emergency", "hgv", "goods", "bus", "psv", "taxi", "coach"),
     *("tourist_bus", "motorcycle", "moped", "bicycle", "foot", "caravan", "motorhome", "horse", "trailer"),
 )  # fmt: skip
-"""Values of access, and keys whose value `only` says the same, that let no ordinary car in."""
 
 
 def decisive_access(tags: Mapping[str, str], prefix: str = "") -> str | None:
@@ -427,12 +426,12 @@ def road_ends(roads: Sequence[Road]) -> list[tuple[Road, FloatArray, bool]]:
     ]
 
 
+# Why turns are left out.
 NO_LANE, SPLIT, CUTS = (
     "on streets that are no lanes",
     "at a junction that is split",
     "that would cut streets off",
 )
-"""Why turns are left out."""
 
 
 class Turns(NamedTuple):

@@ -85,8 +85,8 @@ OFF_STREET = ("driveway", "parking_aisle")  # values of `service` of roads witho
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
+# Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it.
 PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
-"""Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it."""
 NO_ENTRY = "no entry: no street crosses the edge of the map"
 TOO_FAR = f"parking farther than {FACILITY_REACH:g} m from every street"
 NO_GOAL = "no goal: no building and no point of interest in it; export buildings and shops, too"
@@ -626,6 +626,7 @@ WORK = {"commuters": 1.0, "visitors": 0.1, "deliveries": 0.1}
 SHOP = {"shoppers": 1.0, "commuters": 0.2, "deliveries": 0.4}
 LEISURE = {"visitors": 1.0, "commuters": 0.1, "deliveries": 0.1}
 OPEN_TO_ALL = {"visitors": 0.5, "commuters": 0.5, "deliveries": 0.05}
+# Usual levels of a `building`, and whom a square metre of its floor attracts; of others nobody.
 BUILDINGS: dict[str, tuple[float, dict[str, float]]] = {
     **dict.fromkeys(
         ("house", "detached", "semidetached_house", "terrace", "bungalow", "farm"), (2.0, DWELLING)
@@ -643,7 +644,7 @@ BUILDINGS: dict[str, tuple[float, dict[str, float]]] = {
     **dict.fromkeys(("school", "kindergarten", "university", "college", "hospital"), (2.0, OPEN_TO_ALL)),
     **dict.fromkeys(("public", "civic", "church", "train_station", "fire_station"), (1.0, OPEN_TO_ALL)),
 }
-"""Usual levels of a `building`, and whom a square metre of its floor attracts; of others nobody."""
+# Nominal floor, m², of a point with a key (`shop`, `office`, ...) or an `amenity`, and whom it attracts.
 POINTS: dict[str, tuple[float, dict[str, float]]] = {
     "shop": (150.0, SHOP),
     "office": (200.0, WORK),
@@ -661,12 +662,11 @@ POINTS: dict[str, tuple[float, dict[str, float]]] = {
     ),
     **dict.fromkeys(("school", "kindergarten", "university", "college"), (500.0, OPEN_TO_ALL)),
 }
-"""Nominal floor, m², of a point with a key (`shop`, `office`, ...) or an `amenity`, and whom it attracts."""
+# Values of keys that no car comes for.
 QUIET = {
     "tourism": ("information", "artwork", "viewpoint"),
     "leisure": ("garden", "pitch", "playground", "park"),
 }
-"""Values of keys that no car comes for."""
 
 
 def weighted_goals(

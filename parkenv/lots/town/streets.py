@@ -26,6 +26,7 @@ from parkenv.lots.osm.roads import BARRIER_GAP, Rank, Road, barriers_of, read_ro
 from parkenv.world.drive_graph import linestrings, node_labels
 from parkenv.world.lot import MOVES, Lane
 
+# How much traffic a street brings into town, by its class; others 0.25. Assumed: each class has twice the next.
 ENTRY_WEIGHT = {
     "motorway": 16.0,
     "trunk": 12.0,
@@ -35,11 +36,10 @@ ENTRY_WEIGHT = {
     "unclassified": 1.0,
     "residential": 0.5,
 }
-"""How much traffic a street brings into town, by its class; others 0.25. Assumed: each class has twice the next."""
+# Classes of streets that do not end in a town: where they end, the map does.
 THROUGH = ("motorway", "trunk", "primary", "secondary", "tertiary")
-"""Classes of streets that do not end in a town: where they end, the map does."""
+# Limit, km/h, where cars drive at the scenario's speed; least and most speeds of lanes, multiples of it.
 BASE_LIMIT, SPEEDS = 30.0, (0.2, 4.0)
-"""Limit, km/h, where cars drive at the scenario's speed; least and most speeds of lanes, multiples of it."""
 AT_EDGE = 50.0  # distance, m, from the hull of all streets within which streets that end leave the map
 BEYOND = "beyond"  # ids of the ways beyond the edge begin with it
 LONGEST_BEYOND = 600.0  # m, longest way beyond the edge of the map that is assumed

@@ -262,6 +262,7 @@ class AreaRule(NamedTuple):
     typical: int  # places of one whose area is unknown
 
 
+# Rule of each kind; fitted by `python tests/parking_rules.py`, which states the errors.
 RULES = {
     "surface": AreaRule(0.1847, 0.7882, 1.0, 7),
     "boxes": AreaRule(0.0574, 1.0, 1.0, 4),
@@ -269,12 +270,11 @@ RULES = {
     "multi-storey": AreaRule(0.0377, 1.0, 4.7, 350),
     "rooftop": AreaRule(0.0342, 1.0, 1.0, 45),
 }
-"""Rule of each kind; fitted by `python tests/parking_rules.py`, which states the errors."""
+# Rule for each value of `parking`; `surface` for others.
 KINDS = {
     **dict.fromkeys(("garage", "garages", "garage_boxes", "carport", "carports", "sheds"), "boxes"),
     **{"underground": "underground", "multi-storey": "multi-storey", "rooftop": "rooftop"},
 }
-"""Rule for each value of `parking`; `surface` for others."""
 GARAGES = ("underground", "multi-storey", "rooftop")  # rules of what is a garage: it has a barrier and ramps
 
 
@@ -300,12 +300,12 @@ def expected_capacity(rule: str, area: float | None, levels: float | None) -> in
 
 
 GATE_S = 10.0  # s that the barrier of a garage takes for a car
+# Seconds from the entry of a counted facility to a space, when it is empty and when it is full.
 INSIDE_S = {"garage": (30.0, 120.0), "lot": (10.0, 30.0)}
-"""Seconds from the entry of a counted facility to a space, when it is empty and when it is full."""
+# Columns of the table of facilities: `capacity_from` is tag, drawn, list, register or rule, `rule` which one; `slots`
+# of the capacity are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a
+# kerb with its side.
 TABLE = ("name", "kind", "capacity", "capacity_from", "rule", "zone", "slots", "tagged", "element")
-"""Columns of the table of facilities: `capacity_from` is tag, drawn, list, register or rule, `rule` which one; `slots`
-of the capacity are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a kerb
-with its side."""
 
 
 @dataclass(eq=False)
@@ -431,10 +431,10 @@ PLACES_PER_METRE = {
 
 Fitted to the 43,863 places of Berlin-Neukölln by `python tests/parking_rules.py`, which says how well.
 """
+# Kerb taken by a place, m, by orientation; from the same kerbs.
 METRES_PER_PLACE = {"parallel": 5.4, "diagonal": 3.1, "perpendicular": 2.6}
-"""Kerb taken by a place, m, by orientation; from the same kerbs."""
+# Values of `parking` of areas that are kerbs.
 STRIPS = ("street_side", "lane", "on_kerb", "half_on_kerb", "shoulder")
-"""Values of `parking` of areas that are kerbs."""
 CLASS_RULE = "class of street"  # name of the rule of kerbs that the map says nothing of
 HOUSES_WITHIN = 40.0  # m; where no building is this near, an untagged street has no places
 STATION = 20.0  # m, between the points of a street at which buildings are looked for

@@ -17,8 +17,8 @@ from parkenv.errors import InputError
 from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.rig import Mount
 
+# From the axes of a picture (right, down, ahead) to those of a vehicle (ahead, left, up).
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""From the axes of a picture (right, down, ahead) to those of a vehicle (ahead, left, up)."""
 _LEVEL = 1e-6  # rad
 _OFF_CENTRE = 0.1  # of the picture's size; the principal point of pictures that are not rectified is nearer
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")

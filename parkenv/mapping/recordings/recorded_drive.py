@@ -44,8 +44,8 @@ from parkenv.world.week import DAY_S
 from sim_sensors.camera.models import Frame, StereoFrame
 from sim_sensors.rig import Capture, SensorRig, TimedCapture
 
+# Longest times between a picture and what joins it, s: the right picture of a pair, another camera, a laser.
 PAIR_S, CAMERAS_S, LASER_S = 0.001, 0.1, 0.5
-"""Longest times between a picture and what joins it, s: the right picture of a pair, another camera, a laser."""
 FAR_M = 500.0  # farther from the lot are poses of another frame
 _STILL = 1e-3, 1e-4  # m and rad in a scan, below which nothing is to correct
 _NO_DEPTH, _NO_IDS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)

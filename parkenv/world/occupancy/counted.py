@@ -34,8 +34,8 @@ from parkenv.world.occupancy.process import (
 from parkenv.world.occupancy.recorded import read_mapping, some_mapped
 from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S
 
+# Bounds of the mean occupancy of a lot: beyond them, slots would be taken or free for ever.
 LEAST, MOST = 0.002, 0.998
-"""Bounds of the mean occupancy of a lot: beyond them, slots would be taken or free for ever."""
 _QUADRATURE = NormalQuadrature.gauss_hermite(9)
 _PASSES = 3  # over the day; the curve of a process is periodic
 
@@ -192,8 +192,7 @@ def car_park_of_slots(mapping: str | Path, lot: ParkingLot, counts: Counts) -> I
     return some_mapped(of_slot, "mapping 'same': facility or zone", counts.car_parks, counts.source)
 
 
-MOST_GAP_S = 2 * HOUR_S
-"""Longest time between counts over which they say how full a car park is, s."""
+MOST_GAP_S = 2 * HOUR_S  # longest time between counts over which they say how full a car park is, s
 
 
 def log_of_counts(

@@ -15,8 +15,7 @@ from pydantic import ConfigDict, Field
 from parkenv.compiled.arrays import FloatArray
 from parkenv.files.field_types import NotNegative, Validated
 
-MAX_LOGITS = 5.0
-"""Largest standard deviation of a level or slope; days then are almost empty or almost full."""
+MAX_LOGITS = 5.0  # largest standard deviation of a level or slope; days then are almost empty or almost full
 Deviation = Annotated[NotNegative, Field(le=MAX_LOGITS)]
 
 
@@ -39,8 +38,7 @@ class DayError(Validated):
         return np.hypot(self.level, self.slope * np.asarray(nearness, np.float64))
 
 
-EXACT = DayError()
-"""The day error of a forecast that is right on every day."""
+EXACT = DayError()  # the day error of a forecast that is right on every day
 
 
 def nearness(walk: ArrayLike) -> FloatArray:

@@ -25,8 +25,8 @@ from parkenv.world.week import DAY_S, HOUR_S
 # From once in 30 years to once a second; bounds for rates that the observations do not determine.
 _LOG_RATE_BOUNDS = (math.log(1e-9), 0.0)
 _LOG_FACTOR_BOUNDS = (-8.0, 8.0)
+# Changes of state in an hour at which its own decay rate counts as much as the whole day's.
 PRIOR_CHANGES = 10.0
-"""Changes of state in an hour at which its own decay rate counts as much as the whole day's."""
 _TINY = 1e-300
 _DAY_HOURS = 24
 _N_BINS = 2 * _DAY_HOURS  # hours of a weekday, hours of a weekend day

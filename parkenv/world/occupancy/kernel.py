@@ -50,11 +50,12 @@ _MOMENT_S = 1e-6
 kernel = compiled(error_model="numpy", _nrt=False)
 inlined = compiled(error_model="numpy", _nrt=False, forceinline=True)
 
+# Kinds of worlds: a generating process; a replayed log; functions at addresses, such as those of a Python class;
+# slots that a fleet of cars shares. Kinds of forecasts: the first two, and EXTERNAL_KIND, computed in Python at every
+# arrival.
 PROCESS_KIND, LOG_KIND, EXTERNAL_KIND, SHARED_KIND = range(4)
-"""Kinds of worlds: a generating process; a replayed log; functions at addresses, such as those of a Python class; slots
-that a fleet of cars shares. Kinds of forecasts: the first two, and EXTERNAL_KIND, computed in Python at every arrival.
-"""
 
+# An `OccupancyProcess`.
 PROCESS = np.dtype(
     [
         # float64 arrays; a row of the first three is the state before the change.
@@ -70,7 +71,6 @@ PROCESS = np.dtype(
     ],
     align=True,
 )
-"""An `OccupancyProcess`."""
 
 WORLD_FIELDS = [
     ("key", np.uint64),
@@ -80,9 +80,9 @@ WORLD_FIELDS = [
     ("day_odds", np.float64),  # the day's level, as a factor of the odds
     ("day_slope", np.float64),  # logits
 ]
-WORLD = np.dtype(WORLD_FIELDS, align=True)
-"""The world of an episode in a process."""
+WORLD = np.dtype(WORLD_FIELDS, align=True)  # the world of an episode in a process
 
+# A log day replayed on a lot.
 RECORDED_DAY = np.dtype(
     [
         ("midnight", np.float64),  # s since Monday 00:00
@@ -91,12 +91,10 @@ RECORDED_DAY = np.dtype(
     ],
     align=True,
 )
-"""A log day replayed on a lot."""
 
+# A world by the addresses of two functions of (int64 data, int64 slot, float64 time, s): whether the slot is taken, 1
+# or 0; the earliest time from then on at which it is free, s, infinite if never. They return float64.
 FUNCTIONS = np.dtype([("data", np.int64), ("state", ADDRESS), ("next_free", ADDRESS)], align=True)
-"""A world by the addresses of two functions of (int64 data, int64 slot, float64 time, s): whether the slot is taken,
-1 or 0; the earliest time from then on at which it is free, s, infinite if never. They return float64.
-"""
 
 CURSOR_FIELDS = [
     ("since", np.float64),  # begin of the sojourn, s
@@ -105,8 +103,7 @@ CURSOR_FIELDS = [
     ("occupied", np.bool_),
     ("end_known", np.bool_),  # whether it ends exactly then
 ]
-CURSOR = np.dtype(CURSOR_FIELDS, align=True)
-"""The computed part of one slot's true state."""
+CURSOR = np.dtype(CURSOR_FIELDS, align=True)  # the computed part of one slot's true state
 
 process_at, world_at = record_at(PROCESS), record_at(WORLD)
 recorded_day_at, cursor_at = record_at(RECORDED_DAY), record_at(CURSOR)

@@ -29,10 +29,8 @@ from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, PERIOD_S
 DayClass = Literal["weekday", "weekend"]
 
 MAX_GAP_S = 7200.0
-SAMPLE_S = 900.0
-"""Time between the pairs of observations of a log that has each change, s."""
-MAX_RECORDS = 5_000_000
-"""Maximum number of slots times days of a log, each of which takes half a kilobyte."""
+SAMPLE_S = 900.0  # time between the pairs of observations of a log that has each change, s
+MAX_RECORDS = 5_000_000  # maximum number of slots times days of a log, each of which takes half a kilobyte
 
 
 def weekday_of(day: str) -> int:

@@ -24,11 +24,11 @@ OCCUPIED = np.array(
         *(25, 25, 24, 20, 20, 25, 23, 25, 23, 25, 27, 27, 28, 29, 31, 31, 30, 30, 29, 28, 24, 22, 21, 19),
     ]
 )
+# Logits above that week of the car park that is fuller than each of `LEVEL_SHARES` of all.
 LEVELS = (-1.65, -0.98, -0.40, 0.00, 0.38, 1.01, 1.87)
-"""Logits above that week of the car park that is fuller than each of `LEVEL_SHARES` of all."""
+# Share of car parks that a lot is fuller than, by default: drivers search for a space where few are left.
 FULLER_THAN = 0.9
-"""Share of car parks that a lot is fuller than, by default: drivers search for a space where few are left."""
+# Logits by which demand rises from the middle to the goal, and standard deviation between equally near slots.
 PULL, UNEVENNESS = 1.75, 0.6
-"""Logits by which demand rises from the middle to the goal, and standard deviation between equally near slots."""
+# Standard deviation of a weekday's level around the week of its own car park, logits, in the fuller half of them.
 DAY_ERROR = 0.7
-"""Standard deviation of a weekday's level around the week of its own car park, logits, in the fuller half of them."""
