@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from textwrap import shorten
@@ -29,8 +29,6 @@ from parkenv.show.tables import Column, plural
 from parkenv.world.tariff import NO_ZONE
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from parkenv.lots.draft import ImportOptions, Provenance
     from parkenv.world.lot import ParkingLot
 
@@ -89,7 +87,7 @@ class Show(Command):
         picture = self.out or Path(file_name(lot.name, ".png"))
         guesses = origin.guesses if origin is not None else ()
         save_lot_picture(lot, picture, show_graph=self.graph, guesses=guesses)
-        _print_each(self.console, "guessed", guesses, "cyan")
+        self.say(*(f"guessed: {guess}" for guess in guesses), style="cyan")
         self.say(f"{_summary(lot)}. Picture: {picture}")
 
 
@@ -126,7 +124,7 @@ class Check(Command):
         for problem in problems:
             feature = "" if problem.feature is None else f"feature {problem.feature}: "
             style = "red" if problem.severity == "error" else "yellow"
-            _print_each(self.console, problem.severity, [f"{feature}{problem.message}"], style)
+            self.say(f"{problem.severity}: {feature}{problem.message}", style=style)
         errors = sum(p.severity == "error" for p in problems)
         counts = f"{plural(errors, 'error')}, {plural(len(problems) - errors, 'warning')}"
         self.say(f"{self.place}: {counts if problems else 'no errors, no warnings'}")
@@ -345,13 +343,11 @@ class Import(Command):
             )  # fmt: skip
         draft = town.draft if town is not None else import_lot(self.place, self._options)
         draft = draft.in_left_hand_traffic() if self.left_hand else draft
-        for line in draft.found:
-            self.say(line)
-        _print_each(self.console, "guessed", draft.guesses, "cyan")
+        self.say(*draft.found)
+        self.say(*(f"guessed: {guess}" for guess in draft.guesses), style="cyan")
         bays_out = () if town is None else town.bays_left_out
-        _print_each(
-            self.console, "left out", [left for left in draft.left_out if left not in bays_out], "yellow"
-        )
+        left_out = (f"left out: {left}" for left in draft.left_out if left not in bays_out)
+        self.say(*left_out, style="yellow")
         if self.picture is not None:
             from parkenv.show.figures.lots import save_import_picture, save_town_picture
 
@@ -460,11 +456,6 @@ class Convert(Command):
 
         write_lot(load_lot(self.lot), self.out)
         self.say(f"Wrote {self.out}")
-
-
-def _print_each(console: Console, what: str, texts: Iterable[object], style: str) -> None:
-    for text in texts:
-        console.print(f"{what}: {text}", style=style)
 
 
 def _provenance(path: Path) -> Provenance | None:

@@ -27,8 +27,6 @@ from parkenv.studies.fields import AgentSpec, OneAgent, OneScenario, Seed
 from parkenv.studies.fleet.setting import COLUMNS
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from parkenv.studies.occupancy import FitReport
 
 SCORE_COLUMNS = (
@@ -99,7 +97,7 @@ class Fit(Command):
             make_folder(self.out)
             recorded = RecordedFile((self.log,), self.timezone, self.capacity, self.columns)
             report = fit(recorded, self.out, max_gap_s=3600.0 * self.max_gap_h, progress=progress)
-        _show(self.console, report, self.out, None, COLUMNS)
+        _show(self, report, self.out, None, COLUMNS)
 
 
 class Evaluate(Command):
@@ -143,9 +141,7 @@ class Evaluate(Command):
                 seed=self.seed,
                 progress=progress,
             )
-        _show(
-            self.console, report, self.out, self.seed, SCORE_COLUMNS, [column.key for column in SCORE_COLUMNS]
-        )
+        _show(self, report, self.out, self.seed, SCORE_COLUMNS, [column.key for column in SCORE_COLUMNS])
 
 
 class Record(Command):
@@ -184,15 +180,14 @@ class Record(Command):
 
 
 def _show(
-    console: Console,
+    command: Command,
     report: FitReport,
     out: Path,
     seed: int | None,
     columns: Sequence[Column],
     keys: Sequence[str] = (),
 ) -> None:
-    print_rows(console, report.title, report.summary["rows"], keys, columns)
-    for note in report.notes:
-        console.print(note, soft_wrap=True)
+    print_rows(command.console, report.title, report.summary["rows"], keys, columns)
+    command.say(*report.notes, soft_wrap=True)
     save_summary(out, seed, **report.summary)
-    console.print(f"Summary and pictures are in {out}")
+    command.say(f"Summaryand pictures are in {out}")

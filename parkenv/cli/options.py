@@ -56,8 +56,9 @@ class Command(Spec):
     def console(self) -> Console:
         return make_console(soft_wrap=self.soft_wrap)
 
-    def say(self, text: str, **how: Any) -> None:
-        self.console.print(text, **how)
+    def say(self, *texts: str, **how: Any) -> None:
+        for text in texts:
+            self.console.print(text, **how)
 
     @abstractmethod
     def run(self) -> None: ...

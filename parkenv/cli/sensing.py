@@ -27,8 +27,6 @@ from parkenv.world.occupancy.arrival_window import DAY_NAMES
 from parkenv.world.week import DAY_S, HOUR_S
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from parkenv.studies.results import Row
     from parkenv.world.scenario import Scenario
 
@@ -114,19 +112,19 @@ class MapDrive(Command):
         save_summary(self.out, None, rows)
         for row in rows:
             print_table(self.console, table_of("", "The drive", [row], COLUMNS, facts=True))
-            self._warn(self.console, row, scenario)
+            self._warn(row, scenario)
         lot = "lot.geojson, " if self.discover else ""
         written = "map.png, map.yaml, slots.geojson, slots.png, cars.csv, sightings.csv, summary.json"
         self.say(f"Written: {self.out / 'map.sqlite'}, {lot}{written}")
 
-    def _warn(self, console: Console, row: Row, scenario: Scenario | None) -> None:
+    def _warn(self, row: Row, scenario: Scenario | None) -> None:
         driven_in = row["key"].partition("/")[0]
         if scenario and driven_in in SCENARIO_NAMES and driven_in != scenario.name:
             text = f"The drive was recorded in {driven_in}, and is mapped in {scenario.name}: see --scenario"
-            console.print(text, style="yellow")
+            self.say(text, style="yellow")
         if not row["seen"]:
             why = f": poses ± {row['pose_error_m']:.2g} m; see --pose-error" if "pose_error_m" in row else ""
-            console.print(f"No slot could be identified{why}", style="yellow")
+            self.say(f"No slot could be identified{why}", style="yellow")
 
 
 class Map(Command):

@@ -21,12 +21,7 @@ from parkenv.engine.kernel import (
     step_noisy_at,
     step_result_at,
 )
-from parkenv.engine.local_observation import (
-    NEAR_SLOTS,
-    Surroundings,
-    local_space,
-    observe_surroundings_at,
-)
+from parkenv.engine.local_observation import NEAR_SLOTS, Surroundings, local_space, observe_surroundings_at
 from parkenv.engine.searches import START_OPTIONS, ScenarioRecords, Searches, choose_start
 from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout, action_number, space_of
 from parkenv.engine.state import SearchState

@@ -19,6 +19,8 @@ LocaliserName = Literal["none", "scan-matching"]
 # What corrects the pose of a survey's car; see `parkenv.mapping.scan_matching`.
 LOCALISERS: tuple[LocaliserName, ...] = get_args(LocaliserName)
 MapName = Literal["empty", "right", "wrong"]  # maps that a commute starts from
+# Column `map` of the references: a right map that does not learn; an agent that uses no map.
+FIXED, NONE = "fixed", "none"
 # What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`.
 KnowledgeName = Literal["own", "shared", "reserve", "full"]
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)

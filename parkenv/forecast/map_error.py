@@ -186,10 +186,7 @@ class MapError:
         clock = (hours - 0.5) % HOURS
         before, part = np.floor(clock), clock % 1.0
         after = (before + 1.0) % HOURS
-        return [
-            ((first + before).astype(np.int64), 1.0 - part),
-            ((first + after).astype(np.int64), part),
-        ]
+        return [((first + before).astype(np.int64), 1.0 - part), ((first + after).astype(np.int64), part)]
 
 
 def _summed(parts: Iterable[FloatArray]) -> FloatArray:

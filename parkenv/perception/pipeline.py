@@ -14,23 +14,12 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import ahead_in_threads, in_threads
 from parkenv.errors import InputError
-from parkenv.perception.detector import (
-    PROBABILITY,
-    Detections,
-    Detector,
-    DetectorErrors,
-    detect_in,
-)
+from parkenv.perception.detector import PROBABILITY, Detections, Detector, DetectorErrors, detect_in
 from parkenv.perception.detector_registry import make_detector
 from parkenv.perception.ground_detector import ground_band
 from parkenv.perception.monocular import GroundView, RangingErrors, localize_boxes, street_pitch
 from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
-from parkenv.perception.ranging import (
-    LocatedCars,
-    localize_cars,
-    localize_disparity,
-    localize_median,
-)
+from parkenv.perception.ranging import LocatedCars, localize_cars, localize_disparity, localize_median
 from parkenv.perception.slot_filter import OCCLUDED, SlotFilter, SlotObservation
 from parkenv.world.lot import ParkingLot
 from sim_sensors.camera.models import PinholeCamera, StereoCamera

@@ -153,8 +153,7 @@ class RealWeek(Spec):
     """A week as counted in real car parks: what a lot file alone has."""
 
     fuller_than: Probability = Field(
-        FULLER_THAN,
-        description="Fraction of real car parks that are less full; 0.5 for the typical one.",
+        FULLER_THAN, description="Fraction of real car parks that are less full; 0.5 for the typical one."
     )
     pull: float = Field(
         PULL, ge=-10, le=10, description="Rise of demand from the middle of the lot to the goal, logits."
@@ -268,8 +267,7 @@ class OccupancySpec(Spec):
     real_week: RealWeek | None = None
     process: FilePath | None = Field(None, description="Rates from `parkenv occupancy fit` (.json).")
     log: _Logs | None = Field(
-        None,
-        description="A recorded log (.csv, .csv.gz), or several of the same slots, replayed day by day.",
+        None, description="A recorded log (.csv, .csv.gz), or several of the same slots, replayed day by day."
     )
     counts: CountsSpec | None = None
     car_parks: Several[str] | None = option(
@@ -283,12 +281,7 @@ class OccupancySpec(Spec):
         parse=words_in,
     )
     capacity: Capacity | None = option(
-        None,
-        CAPACITY_HELP,
-        takes="PLACES|FILE|largest",
-        panel="World",
-        default="the file's",
-        parse=str,
+        None, CAPACITY_HELP, takes="PLACES|FILE|largest", panel="World", default="the file's", parse=str
     )
     timezone: str | None = option(None, TIMEZONE_HELP, takes="NAME", panel="World", default="times are local")
     columns: str | None = option(

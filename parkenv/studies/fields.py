@@ -21,13 +21,7 @@ from parkenv.files.limited_reading import is_there
 from parkenv.files.option import Inside, Option, parse_call, seconds_of_minutes, words_in
 from parkenv.files.spec_file import Axis, DetectorName, OrText, Several, Spec, require_together
 from parkenv.forecast.event_table import is_counts
-from parkenv.scenarios.spec import (
-    ScenarioSpec,
-    TrafficSpec,
-    lot_scenario,
-    scenario_spec,
-    scenario_specs,
-)
+from parkenv.scenarios.spec import ScenarioSpec, TrafficSpec, lot_scenario, scenario_spec, scenario_specs
 from planners.names import AGENTS, FILE_AGENTS
 
 OptionValue = bool | int | float | str

@@ -23,13 +23,7 @@ from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.tables import part_of, tables_of
 from parkenv.studies.fields import split_agents
-from parkenv.studies.results import (
-    EPISODES,
-    Key,
-    Results,
-    Row,
-    Table,
-)
+from parkenv.studies.results import EPISODES, Key, Results, Row, Table
 from parkenv.studies.workers import Task, Workers
 
 if TYPE_CHECKING:

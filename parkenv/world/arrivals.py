@@ -93,8 +93,7 @@ class PoissonArrivals(Validated, Arrivals):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(
-            self.end_s > self.start_s,
-            f"end_s is {self.end_s}, want a number above start_s, {self.start_s:g}",
+            self.end_s > self.start_s, f"end_s is {self.end_s}, want a number above start_s, {self.start_s:g}"
         )
         require(
             self.expected > 0.0 and self.max_cars <= MAX_CARS,

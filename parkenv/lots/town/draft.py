@@ -34,13 +34,7 @@ from parkenv.lots.draft import UNREACHED, LeftOut, LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots, nearest_on_lanes
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.conditions import RESERVED_PLACES, closed_parking, note_other_keys
-from parkenv.lots.osm.draft import (
-    MAPPED_OVERLAP,
-    NO_AISLE,
-    RULE_OVERLAP,
-    MapImport,
-    refuse_far_away,
-)
+from parkenv.lots.osm.draft import MAPPED_OVERLAP, NO_AISLE, RULE_OVERLAP, MapImport, refuse_far_away
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.parking import (
     CAR_SPACES,

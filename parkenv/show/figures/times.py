@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import require
-from parkenv.files.known_names import UNBEATEN
+from parkenv.files.known_names import FIXED, NONE, UNBEATEN
 from parkenv.show.figures.charts import (
     BOLD,
     COLORS,
@@ -97,7 +97,7 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
     style: dict[str, Any] = {"key": key, "key_style": {"ncols": keys}, "label": {"x": _TOTAL}, "share": "x"}
     figure = draw_panels(panels, size, columns, _name(rows), bold=True, **style)
     for ax in figure.axes:
-        ax.xaxis.label.set_color("#444444")
+        ax.xaxis.label.set_color(_GREY)
     return figure
 
 
@@ -301,12 +301,10 @@ def _each(searches: Sequence[int]) -> str:
     return f" ({plural(searches[0], 'search', 'searches')})" if len(set(searches)) == 1 else ""
 
 
-# Column `map` of the references: a right map that does not learn; an agent that uses no map.
-FIXED, NONE = "fixed", "none"
 _WORDS = {"empty": "empty map at first", "right": "right map at first", "wrong": "wrong map at first"}
 _DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))  # lines of an agent with different options
 _FIXED_LINE: dict[str, Any] = {"linewidth": 1.2, "linestyle": (0, (1, 1))}
-_INK = "#444444"
+_GREY = "#444444"
 _NONE_LINE: dict[str, Any] = {"linewidth": 1.4, "linestyle": (0, (4, 2))}
 
 
@@ -336,7 +334,7 @@ def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
             Line(
                 [row["day"] for row in right],
                 [row["forecast_error"] for row in right],
-                _INK,
+                _GREY,
                 _FIXED_LINE | {"zorder": 1},
             ),
             *_bands(its[start], "forecast_error"),
@@ -350,7 +348,7 @@ def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
     ]
     without = dict.fromkeys(row["agent"] for row in rows if row["map"] == NONE)
     key += [key_line(f"{agent}, no map", colors[agent], **_NONE_LINE) for agent in without]
-    key.append(key_line("right map that does not learn", _INK, **_FIXED_LINE))
+    key.append(key_line("right map that does not learn", _GREY, **_FIXED_LINE))
     size = 1.2 + max(2.9 * len(columns), 4.4), 5.6
     keys = {"ncols": max(2, int(size[0] // 2.2))}
     figure = draw_panels([*above, *below], size, len(columns), share="column", key=key, key_style=keys)
@@ -377,9 +375,9 @@ def _excess(learned: Sequence[Row], others: Sequence[Row]) -> tuple[list[Mark], 
     words = "\n".join(f"{agent} \N{UPWARDS ARROW} {excess:+.0f} s" for agent, excess in far.items())
 
     def name_far(ax: Axes) -> None:
-        ax.text(0.98, 0.97, words, transform=ax.transAxes, ha="right", va="top", color="#444444")
+        ax.text(0.98, 0.97, words, transform=ax.transAxes, ha="right", va="top", color=_GREY)
 
-    marks: list[Mark] = [level(0.0, "#444444", linewidth=0.9, zorder=1), *_bands(learned, "excess_s")]
+    marks: list[Mark] = [level(0.0, _GREY, linewidth=0.9, zorder=1), *_bands(learned, "excess_s")]
     marks += [
         level(excess, _color(agent), **_NONE_LINE, zorder=1)
         for agent, excess in levels.items()

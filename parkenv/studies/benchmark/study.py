@@ -15,7 +15,7 @@ from parkenv.files.option import Inside, Option, option
 from parkenv.show.tables import Column, shared, spread, table_of
 from parkenv.studies.compare.comparison import CaseStudy
 from parkenv.studies.fields import Agents, AgentSpec, ScenarioItem, one_word
-from parkenv.studies.results import Results, Row
+from parkenv.studies.results import Results, Row, agent_fingerprints, fingerprints, flat_tables
 from parkenv.studies.study import Cell
 from parkenv.studies.workers import Task
 from parkenv.version import __version__
@@ -97,7 +97,6 @@ class Benchmark(CaseStudy):
         self.cells()
 
     def settings(self) -> Row:
-        from parkenv.studies.results import agent_fingerprints, fingerprints, flat_tables
 
         return {
             "version": __version__,

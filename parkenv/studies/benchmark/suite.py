@@ -41,13 +41,7 @@ from parkenv.studies.compare.cases import Case, at_occupancy, check_worlds, requ
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.fields import AgentSpec, require_agents
 from parkenv.studies.results import SETTING_COLUMNS, Key, Row, decision_s, without_nan
-from parkenv.studies.statistics import (
-    Estimate,
-    columns_of,
-    decision_columns,
-    stratified_estimate,
-    summarize,
-)
+from parkenv.studies.statistics import Estimate, columns_of, decision_columns, stratified_estimate, summarize
 from parkenv.studies.study import Cell
 from parkenv.version import __version__
 from parkenv.world.occupancy.arrival_window import ArrivalWindow

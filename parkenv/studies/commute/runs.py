@@ -19,6 +19,7 @@ import numpy as np
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
+from parkenv.files.known_names import FIXED, NONE
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.trips import Trip
@@ -32,8 +33,6 @@ from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 
-# Names in the column `map` of the references: a right map that does not learn; an agent that uses no map.
-FIXED, NONE = "fixed", "none"
 _Runs = dict[int, list[Row]]
 
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from parkenv.errors import require
-from parkenv.files.known_names import MapName
+from parkenv.files.known_names import FIXED, NONE, MapName
 from parkenv.files.option import option
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.tables import Column, shared
+from parkenv.show.tables import Column, shared, spread, table_of
 from parkenv.studies.fields import (
     Agents,
     AgentSpec,
@@ -29,9 +29,10 @@ from parkenv.studies.fields import (
     require_at_most,
     require_distinct_names,
 )
-from parkenv.studies.results import EPISODES, OUTCOME_COLUMNS, Key, Results, Row, Table
+from parkenv.studies.results import EPISODES, OUTCOME_COLUMNS, Key, Results, Row, Table, search_settings
 from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.workers import Task
+from planners.names import WITHOUT_FORECAST
 
 if TYPE_CHECKING:
     from parkenv.studies.commute.runs import CommuteRun, Day
@@ -130,8 +131,7 @@ class Commute(Study):
 
     @cached_property
     def runs(self) -> list[CommuteRun]:
-        from parkenv.studies.commute.runs import FIXED, NONE, CommuteRun
-        from planners.names import WITHOUT_FORECAST
+        from parkenv.studies.commute.runs import CommuteRun
 
         return [
             CommuteRun(scenario, agent, name, number, self.fleet, self.seed)
@@ -155,7 +155,6 @@ class Commute(Study):
             run.start_map()
 
     def settings(self) -> Row:
-        from parkenv.studies.results import search_settings
 
         return search_settings(self, "seed", "fleet")
 
@@ -211,7 +210,6 @@ class Commute(Study):
 
     @classmethod
     def printed(cls, summary: Row, folder: Path) -> list[Row]:
-        from parkenv.show.tables import spread, table_of
 
         weeks, tables = summary["weeks"], []
         for title, measure, digits in (

@@ -192,11 +192,7 @@ class _Drives(Spec):
 
 
 def discover_recordings(
-    recordings: Sequence[Path],
-    folder: Path,
-    reader: DriveReader,
-    *,
-    streets: Path | None = None,
+    recordings: Sequence[Path], folder: Path, reader: DriveReader, *, streets: Path | None = None
 ) -> list[Row]:
     """Make a lot and its map from drives past an unknown street, and from those that are in the folder already.
 

@@ -18,7 +18,6 @@ def read_curve(path: Path, columns: Sequence[str] = ()) -> list[Row]:
     curve = [row for _, row in kinds]
     for name in columns:
         require(
-            all(name in row for row in curve),
-            f"{path}: has no column {name!r}, want {', '.join(columns)}",
+            all(name in row for row in curve), f"{path}: has no column {name!r}, want {', '.join(columns)}"
         )
     return curve
