@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import Float32Array
 
 # Materials, each with its own shading: clear-coated paint, glass, dark plastic (trim), rubber, ... the stone of kerbs
-# and walls, and the cloth of pedestrians. An interior is seats and dashboard behind glass.
+# and walls, and the cloth of pedestrians. An interior is seats and dashboard behind glass. A lamp that is lit is LIT.
 Material = IntEnum(
     "Material",
     "PAINT GLASS TRIM RUBBER RIM LAMP TAIL_LAMP REVERSING_LAMP HEAD_LAMP PLATE INTERIOR CHROME FOLIAGE BARK STONE "

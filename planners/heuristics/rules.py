@@ -36,12 +36,10 @@ from parkenv.world.scenario import SearchProblem
 
 GREEDY_GOAL, GREEDY_DRIVE, FIRST_FREE, GREEDY_TOTAL = range(4)
 NO_SLOT = -1
+# How many times `GREEDY_TOTAL` counts the drive to a slot that was not observed, which may be taken.
+# Where one slot in two is free, the drive to a slot with arrival cost c pays off against one that is known to be free,
+# and takes t in all, if drive + c / 2 + (drive + t) / 2 < t, since it may have to drive back: if c + 3 drive < t.
 UNOBSERVED_DETOUR = 3.0
-"""How many times `GREEDY_TOTAL` counts the drive to a slot that was not observed, which may be taken.
-
-Where one slot in two is free, the drive to a slot with arrival cost c pays off against one that is known to be free,
-and takes t in all, if drive + c / 2 + (drive + t) / 2 < t, since it may have to drive back: if c + 3 drive < t.
-"""
 # What `_nearest` ranks slots by: the drive; then the arrival cost; the sum of both.
 BY_DRIVE, BY_DRIVE_THEN_COST, BY_TOTAL = range(3)
 _N_MOVES = len(MOVES)

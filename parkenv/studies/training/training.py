@@ -597,8 +597,6 @@ def clone(
     model: OnPolicyAlgorithm, demonstrations: Demonstrations, seed: int, updates: int = UPDATES
 ) -> None:
     """Fit an untrained model's policy to demonstrations, and its value function to the remaining search time."""
-    import torch
-
     policy, rng = model.policy, np.random.default_rng(seed)
     optimizer = torch.optim.Adam(policy.parameters(), lr=LEARNING_RATE)
     # Copies: a worker process has the arrays in shared memory, which PyTorch must not write.
