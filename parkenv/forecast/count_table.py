@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, require
 from parkenv.files.limited_reading import csv_rows
 from parkenv.files.option import columns_in
 
@@ -189,12 +189,11 @@ def read_table(
             places = capacity if isinstance(capacity, int | float) else stated.get(name, free + taken)
         free = places - taken if free_at is None else free
         table.append((names.setdefault(name, len(names)), time, places, free, taken))
-    if not table:
-        raise InputError(f"{path}: has no readings, want at least one")
-    if isinstance(capacity, int | float) and len(names) > 1:
-        raise InputError(
-            f"{path}: has {len(names)} car parks, want a column of their capacities, or --capacity FILE"
-        )
+    require(table, f"{path}: has no readings, want at least one")
+    require(
+        len(names) == 1 or not isinstance(capacity, int | float),
+        f"{path}: has {len(names)} car parks, want a column of their capacities, or --capacity FILE",
+    )
     _require_no_thousands(path, numbers)
     readings = np.array(table, float)
     if capacity == LARGEST:
@@ -230,8 +229,7 @@ def _kinds(path: str | Path, header: Sequence[str]) -> dict[str, int]:
 
 
 def _columns(path: str | Path, header: Sequence[str], capacity: Capacity) -> dict[str, int]:
-    if not header:
-        raise InputError(f"{path}: is empty, want a table of counts")
+    require(header, f"{path}: is empty, want a table of counts")
     at = _kinds(path, header)
     lacks = {
         "a column of times (hour, hour_utc, time or time_utc)": at.keys().isdisjoint(("date", *TIMES)),
@@ -250,10 +248,10 @@ def _columns(path: str | Path, header: Sequence[str], capacity: Capacity) -> dic
         )
     if capacity is not None and "capacity" in at:
         raise InputError(f"{path}: has a column {header[at['capacity']]!r}, want no --capacity with it")
-    if len(at.keys() & set(TIMES)) > 1:
-        raise InputError(
-            f"{path}: has several columns of times, want one of hour, hour_utc, time and time_utc"
-        )
+    require(
+        len(at.keys() & set(TIMES)) <= 1,
+        f"{path}: has several columns of times, want one of hour, hour_utc, time and time_utc",
+    )
     return at
 
 
@@ -300,10 +298,10 @@ def _in_order(path: str | Path, names: dict[str, int], values: FloatArray, befor
     time = moments if per_hour >= FINE else values[:, 1]
     days = (time // DAY_S).astype(np.int64)
     n_days = int(days.max() - days.min()) + 1
-    if n_days * len(names) > MAX_DAYS:
-        raise InputError(
-            f"{path}: has {len(names):,} car parks over {n_days:,} days, want at most {MAX_DAYS:,} in all"
-        )
+    require(
+        n_days * len(names) <= MAX_DAYS,
+        f"{path}: has {len(names):,} car parks over {n_days:,} days, want at most {MAX_DAYS:,} in all",
+    )
     return Readings(
         tuple(sorted(names)),
         date.fromordinal(int(days.min()) + FIRST_DAY),

@@ -84,13 +84,9 @@ class Counts:
         capacity: Capacity = None,
         columns: str | None = None,
     ) -> Counts:
-        """Read and clean a file of counts, .csv or .csv.gz.
+        """Read and clean a file of counts, .csv or .csv.gz, see `count_table`.
 
-        Args:
-            path: a table, see `count_table`.
-            timezone: IANA name of the local time, wanted if times are in UTC; of the days of summer time.
-            capacity: places, see `count_table.Capacity`.
-            columns: names of columns that are not recognised, see `count_table.chosen`.
+        The IANA name of the local time is wanted if times are in UTC; it tells the days of summer time.
         """
         return _cleaned(read_table(path, timezone, capacity, columns), timezone, str(path))
 
@@ -220,31 +216,27 @@ def _summer_time(days: tuple[date, ...], zone: ZoneInfo) -> dict[int, int]:
 def _by_hour(readings: Readings, changes: dict[int, int]) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     """Return capacities (c, d), the last of each day, readings (c, d, 24), and the number of duplicates (c,)."""
     c, d = len(readings.car_parks), readings.n_days
-    usable = np.isfinite(readings.free) & (readings.capacity > 0) & np.isfinite(readings.capacity)
-    park_day = (readings.park * d + readings.day)[usable]
-    key = park_day * HOURS + readings.hour[usable]
-    free, stated = np.full(c * d * HOURS, np.nan), np.full(c * d, np.nan)
-    free[key], stated[park_day] = readings.free[usable], readings.capacity[usable]  # the last one stays
-    times = np.bincount(key, minlength=free.size)
+    known = np.isfinite(readings.free) & (readings.capacity > 0) & np.isfinite(readings.capacity)
+    columns = (readings.park, readings.day, readings.hour, readings.second, readings.free, readings.capacity)
+    park, day, hour, second, free, capacity = (column[known] for column in columns)
+    stated = np.full((c, d), np.nan)
+    stated[park, day] = capacity  # the last one stays
+    cell = (park * d + day) * HOURS + hour
+    order = np.lexsort((np.arange(cell.size), second, cell))
+    kept = np.append(np.diff(cell[order]) > 0, True)[: order.size]
+    twice = np.zeros((c, d, HOURS), bool)
     if readings.per_hour >= FINE:  # all but those at the same time, in the mean
-        order = np.flatnonzero(usable)[np.lexsort((np.arange(key.size), readings.second[usable], key))]
-        second, cell = readings.second[order], (readings.park * d + readings.day) * HOURS + readings.hour
-        kept = order[np.append((np.diff(second) > 0) | (np.diff(cell[order]) > 0), True)[: order.size]]
-        total, n = (
-            np.bincount(cell[kept], readings.free[kept], free.size),
-            np.bincount(cell[kept], minlength=free.size),
-        )
-        free = np.divide(total, n, out=free, where=n > 0)
-        again = np.bincount(readings.park[order], minlength=c) - np.bincount(readings.park[kept], minlength=c)
-        return stated.reshape(c, d), free.reshape(c, d, HOURS), again
-    extra = np.maximum(times - 1, 0).reshape(c, d, HOURS)
-    for day, hour in changes.items():
-        if hour >= 0:
-            twice = (np.arange(c) * d + day) * HOURS + hour
-            total = np.bincount(key, readings.free[usable], free.size)[twice]
-            free[twice] = np.divide(total, times[twice], where=times[twice] > 0, out=np.full(c, np.nan))
-            extra[:, day, hour] = np.maximum(extra[:, day, hour] - 1, 0)
-    return stated.reshape(c, d), free.reshape(c, d, HOURS), extra.sum(axis=(1, 2))
+        kept |= np.append(np.diff(second[order]) > 0, True)[: order.size]
+    else:
+        summer = {day: hour for day, hour in changes.items() if hour >= 0}
+        twice[:, list(summer), list(summer.values())] = True
+        kept |= twice.ravel()[cell[order]]
+    at, values = cell[order][kept], free[order][kept]
+    n = np.bincount(at, minlength=twice.size)
+    mean = np.divide(np.bincount(at, values, n.size), n, where=n > 0, out=np.full(n.size, np.nan))
+    again = np.bincount(park[order[~kept]], minlength=c)
+    again += np.where(twice, np.maximum(n.reshape(twice.shape) - 2, 0), 0).sum(axis=(1, 2))
+    return stated, mean.reshape(twice.shape), again
 
 
 def _carried_forward(values: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.files.option import columns_in
 from parkenv.forecast.count_table import (
     DAY_S,
@@ -132,13 +132,7 @@ def read_events(
 ) -> Events:
     """Read tables of one layout, .csv or .csv.gz, as one.
 
-    Args:
-        paths: the tables.
-        timezone: IANA name of the local time zone, wanted if times are in UTC or have an offset.
-        columns: names of columns that are not recognised, see `columns_in`.
-
-    Raises:
-        InputError: names the file, and the line and value where there is one.
+    The IANA name of the local time zone is wanted if times are in UTC or have an offset; for columns see `columns_in`.
     """
     table, parts, source = _Table(), list[FloatArray](), ",".join(map(str, paths))
     for path in paths:
@@ -201,8 +195,7 @@ class _Table:
             except (ValueError, OverflowError) as fault:
                 bad, first_bad = bad + 1, first_bad or f"line {line}: {fault}"
         self.faults["unreadable"] += bad
-        if bad > n / 2:
-            raise InputError(f"{path}: {bad:,} of {n:,} rows are unreadable: {first_bad}")
+        require(bad <= n / 2, f"{path}: {bad:,} of {n:,} rows are unreadable: {first_bad}")
         table = np.array(values, float).reshape(len(values), 5)
         return np.where(np.isnan(table), np.array(latest)[table[:, 4:].astype(int)], table)[:, :4]
 
@@ -226,7 +219,11 @@ class _Table:
             )
             table = self._dropped("duplicate", table, again)
             self.faults["both_states"] += int((~table.taken).sum())
-            table = self._dropped("full_hours", table, table.ended_by_clock(len(self.bays)))
+            n = np.bincount(table.bay, minlength=len(self.bays))
+            times = (table.start % HOUR_S == 0, table.end % HOUR_S == 0)
+            begins, ends = (np.bincount(table.bay, is_full, len(self.bays)) for is_full in times)
+            by_clock = (n >= _MIN_STAYS) & (ends == n) & (begins < n)
+            table = self._dropped("full_hours", table, by_clock[table.bay])
             table = self._dropped("zero", table, table.end == table.start)
         table = self._dropped("negative", table, table.end < table.start)
         following = np.append(table.start[1:], np.inf)
@@ -270,8 +267,3 @@ class _Rows(NamedTuple):
 
     def kept(self, which: BoolArray | IntArray) -> _Rows:
         return _Rows(self.bay[which], self.start[which], self.end[which], self.taken[which])
-
-    def ended_by_clock(self, n_bays: int) -> BoolArray:
-        n = np.bincount(self.bay, minlength=n_bays)
-        begins, ends = (np.bincount(self.bay, time % HOUR_S == 0, n_bays) for time in (self.start, self.end))
-        return np.asarray(((n >= _MIN_STAYS) & (ends == n) & (begins < n))[self.bay])

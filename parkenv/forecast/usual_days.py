@@ -19,17 +19,9 @@ def usual_days(
 ) -> tuple[FloatArray, FloatArray]:
     """Forecast each day of a car park from all others, before and after it, but not from the day itself.
 
-    Args:
-        occupied: (d, 24) float64, counted fraction of taken places; NaN without a reading.
-        weekday: (d,) days of the week. Monday to Friday, Saturdays and Sundays differ; a day that is the only one of
-            its class is forecast from all others.
-        source: name of the counts in the error.
-
-    Returns:
-        Mean and standard deviation of the error of the occupancy's logit, each (d, 24) float64.
-
-    Raises:
-        InputError: fewer than two days were counted.
+    From fractions of taken places, (d, 24), and days of the week, (d,): mean and standard deviation of the error of the
+    occupancy's logit, (d, 24) each. Monday to Friday, Saturdays and Sundays differ; a day that is the only one of its
+    class is forecast from all others.
     """
     y = logit(np.clip(occupied, _CLIP, 1.0 - _CLIP))
     days = np.flatnonzero(np.isfinite(y).any(axis=1))

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
@@ -185,8 +185,7 @@ class LotDraft:
             raise InputError(f"{what} {problem.message}") from error
 
     def _lot(self) -> ParkingLot:
-        if self.missing:
-            raise InputError("; ".join(self.missing))
+        require(not self.missing, "; ".join(self.missing))
         return ParkingLot(**{name: getattr(self, name) for name in _SHARED}, **self.slots.columns())
 
     def searchable(self) -> Self:

@@ -261,32 +261,21 @@ class StreetGrid:
         """Create slots on both sides of all streets, crossing by crossing; `outer`: also on the outer sides."""
         p = self.crossings
         n_along, n_across = p.shape[:2]
-        row, column = np.indices((n_along, n_across))
+        number = np.arange(n_along * n_across).reshape(n_along, n_across)
         # Each crossing owns the segments of street to its east and to its north.
         start = np.concatenate([p[:, :-1].reshape(-1, 2), p[:-1].reshape(-1, 2)])
         end = np.concatenate([p[:, 1:].reshape(-1, 2), p[1:].reshape(-1, 2)])
         direction = np.concatenate([np.repeat(self.along, n_across - 1), np.tile(self.across, n_along - 1)])
-        owner = np.concatenate(
-            [(row * n_across + column)[:, :-1].ravel(), (row * n_across + column)[:-1].ravel()]
-        )
-        right_open = np.concatenate([row[:, :-1].ravel() > 0, column[:-1].ravel() < n_across - 1])
-        left_open = np.concatenate([row[:, :-1].ravel() < n_along - 1, column[:-1].ravel() > 0])
-
+        owner = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
         backward = (direction < 0)[:, None]
         start, end = np.where(backward, end, start), np.where(backward, start, end)
-        right_open, left_open = (
-            np.where(backward[:, 0], left_open, right_open),
-            np.where(backward[:, 0], right_open, left_open),
-        )
         # Cars on the left of a one-way street face the direction of traffic, of a two-way street the opposite one.
         oneway = direction != 0
         kerb_start = np.concatenate([start, np.where(oneway[:, None], start, end)])
         kerb_end = np.concatenate([end, np.where(oneway[:, None], end, start)])
         on_left = np.concatenate([np.zeros(len(start), dtype=bool), oneway])
         half_width = np.tile(np.where(oneway, ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH), 2)
-        used = np.concatenate([right_open | outer, left_open | outer])
-        used &= np.hypot(*(kerb_end - kerb_start).T) > 2 * CROSSING_CLEARANCE
-
+        used = np.hypot(*(kerb_end - kerb_start).T) > 2 * CROSSING_CLEARANCE
         kerb_start, kerb_end, on_left, half_width = (
             values[used] for values in (kerb_start, kerb_end, on_left, half_width)
         )
@@ -299,7 +288,9 @@ class StreetGrid:
             kerb_end - CROSSING_CLEARANCE * tangent + shift,
             on_left,
         )
-        return slots[np.argsort(np.tile(owner, 2)[used][kerb], kind="stable")]
+        slots = slots[np.argsort(np.tile(owner, 2)[used][kerb], kind="stable")]
+        edge = shapely.Polygon(np.concatenate([p[0], p[1:, -1], p[-1, -2::-1], p[-2:0:-1, 0]]))
+        return slots if outer else slots[shapely.contains_xy(edge, slots.xy)]
 
 
 def outlines(corners: FloatArray, setback: float) -> list[FloatArray]:

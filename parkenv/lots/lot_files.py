@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.compiled.arrays import BoolArray
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, require
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.files.limited_reading import is_there, read_json, read_yaml, unpacked_path
 from parkenv.files.spec_file import Spec
@@ -65,8 +65,7 @@ def load_lot(name_or_path: str | Path) -> ParkingLot:
     if str(name_or_path) in PACKAGED_LOTS:
         return packaged_lot(str(name_or_path))
     path = Path(name_or_path)
-    if not is_there(path):
-        raise InputError(f"{path}: no such file, nor a packaged lot ({', '.join(PACKAGED_LOTS)})")
+    require(is_there(path), f"{path}: no such file, nor a packaged lot ({', '.join(PACKAGED_LOTS)})")
     return read_lot(path)
 
 
@@ -76,8 +75,7 @@ PLACES = Path(__file__).parent / "places"
 
 def packaged_lot(name: str) -> ParkingLot:
     """Load a packaged lot: campus, jam, street, mini."""
-    if name not in PACKAGED_LOTS:
-        raise InputError(f"no packaged lot {name!r}, want one of {', '.join(PACKAGED_LOTS)}")
+    require(name in PACKAGED_LOTS, f"no packaged lot {name!r}, want one of {', '.join(PACKAGED_LOTS)}")
     with resources.as_file(resources.files("parkenv.lots") / "packaged" / f"{name}.geojson") as path:
         return read_lot(path)
 
@@ -138,15 +136,15 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
         from parkenv.lots.formats.slot_list import slot_list_draft
 
         return slot_list_draft(path, options)
-    if file_format is None:
-        raise InputError(
-            f"{path}: unknown kind of file {path.suffix!r}, want .osm, .xml or .pbf (OpenStreetMap), "
-            ".json or .geojson (overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml"
-        )
-    if options.bounds is not None:
-        raise InputError(
-            f"{path}: bounds apply to OpenStreetMap and lists of slots; this file is a whole lot"
-        )
+    require(
+        file_format,
+        f"{path}: unknown kind of file {path.suffix!r}, want .osm, .xml or .pbf (OpenStreetMap), "
+        ".json or .geojson (overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml",
+    )
+    require(
+        options.bounds is None,
+        f"{path}: bounds apply to OpenStreetMap and lists of slots; this file is a whole lot",
+    )
     lot, recognised = _read_whole(path)
     draft = LotDraft.of_lot(lot)
     if recognised:
@@ -199,12 +197,7 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
     Rows of an area are back to back; a single one opens to the nearer aisle. Aisles are the waypoint rows R1 to R4,
     dead ends in the east; C1 and C2 connect them. Cars enter by EXT; the goal is a door at the southern end of C2.
     """
-    document = _MAP.parse(read_yaml(path), str(path))
-    with naming(path):
-        return _lot(document)
-
-
-def _lot(document: Any) -> ParkingLot:
+    document: Any = _MAP.parse(read_yaml(path), str(path))
     lines = {name: np.array(line.bounds) for name, line in document.WAYPOINTS}
     aisle_y = np.array([lines[f"R{k}L"][0, 1] for k in (1, 2, 3, 4)])
     c1, c2 = lines["C1"][0, 0], lines["C2"][0, 0]
@@ -227,21 +220,20 @@ def _lot(document: Any) -> ParkingLot:
             if n_rows == 2:
                 opens_north = row == 0
             # Slots are on the left of the line of their mouths, which runs west for the northern rows.
-            line = (
-                bay_row((east, north), np.pi, n_columns, size=size)
-                if opens_north
-                else bay_row((west, south), 0.0, n_columns, size=size)
-            )
-            parts.append(line[::-1] if opens_north else line)
+            if opens_north:
+                parts.append(bay_row((east, north), np.pi, n_columns, size=size)[::-1])
+            else:
+                parts.append(bay_row((west, south), 0.0, n_columns, size=size))
             slot_ids += [f"{name}-{row}-{column}" for column in range(n_columns)]
-    return ParkingLot(
-        name="dragon-lake",
-        slot_ids=tuple(slot_ids),
-        **Slots.joined(parts).columns(),
-        lanes=tuple(lanes),
-        entries=outside[None],
-        goals=np.array([[80.0, -4.0]]),
-    )
+    with naming(path):
+        return ParkingLot(
+            name="dragon-lake",
+            slot_ids=tuple(slot_ids),
+            **Slots.joined(parts).columns(),
+            lanes=tuple(lanes),
+            entries=outside[None],
+            goals=np.array([[80.0, -4.0]]),
+        )
 
 
 # Distance, m: a lane that ends closer to another one without a common point was probably meant to join it.
@@ -263,14 +255,11 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     """
     path = Path(path)
     file_format = lot_format(path)
-    if file_format is not None and file_format not in WHOLE:
-        return _import_problems(path)
-    if file_format == "dragon-lake":
-        try:
-            dragon_lake_lot(path)
-        except InputError as error:
-            return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
-        return []
+    try:
+        if file_format not in (None, "native"):
+            return _import_problems(path, file_format)
+    except InputError as error:
+        return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
     contents = read_contents(path)
     problems = [*contents.errors, *graph_errors(contents), *_drawing_warnings(contents)]
     if not any(problem.severity == "error" for problem in problems):
@@ -280,11 +269,10 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     return problems
 
 
-def _import_problems(path: Path) -> list[LotProblem]:
-    try:
-        draft = import_lot(path)
-    except InputError as error:
-        return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
+def _import_problems(path: Path, file_format: str | None) -> list[LotProblem]:
+    draft = import_lot(path)
+    if file_format in WHOLE:
+        return []
     problems = [LotProblem("error", None, text) for text in draft.missing]
     warnings = [LotProblem("warning", None, f"left out: {left}") for left in draft.left_out]
     if not problems:
@@ -359,19 +347,12 @@ def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tupl
     points = np.asarray(shapely.points(xy[ends]))
     end, near = tree.query(points, predicate="dwithin", distance=LANE_GAP)
     gap = shapely.distance(points[end], legs[near])
-    loose = (lane_of[ends[end]] != lane_of[leg[near]]) & (gap > 0.0)
-    close = zip(lane_of[ends[end]], lane_of[leg[near]], ends[end], gap, strict=True)
-    seen: set[tuple[int, int]] = set()
-    for (i, j, point, distance), is_loose in zip(close, loose, strict=True):
-        if is_loose and (j, point) not in seen:
-            seen.add((j, point))
-            yield (
-                int(i),
-                (
-                    f"ends {distance:.2f} m from the lane of feature {numbers[j]} without a common point; "
-                    "cars cannot turn there"
-                ),
-            )
+    one, other = lane_of[ends[end]], lane_of[leg[near]]
+    loose = np.flatnonzero((one != other) & (gap > 0.0))
+    _, first = np.unique(np.stack([other, ends[end]])[:, loose], axis=1, return_index=True)
+    for k in loose[np.sort(first)].tolist():
+        far = f"ends {gap[k]:.2f} m from the lane of feature {numbers[other[k]]}"
+        yield int(one[k]), f"{far} without a common point; cars cannot turn there"
 
 
 def _reach(lot: ParkingLot) -> tuple["csr_array[np.float64]", BoolArray, BoolArray]:

@@ -6,8 +6,8 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
-_Notes = dict[tuple[str, str, str], dict[int, Mapping[str, Any]]]
-_NOTES: ContextVar[_Notes | None] = ContextVar("unread tags", default=None)
+Notes = dict[tuple[str, str, str], dict[int, Mapping[str, Any]]]
+_NOTES: ContextVar[Notes | None] = ContextVar("unread tags", default=None)
 
 
 @dataclass(frozen=True)
@@ -27,25 +27,18 @@ def note_unread(tags: Mapping[str, Any], key: str, assumed: str) -> None:
         notes.setdefault((key, str(tags[key]), assumed), {})[id(tags)] = tags
 
 
-class UnreadTable:
-    """The notes of an import."""
-
-    def __init__(self) -> None:
-        self._notes: _Notes = {}
-
-    @property
-    def rows(self) -> tuple[Unread, ...]:
-        """The values, sorted by key, the most frequent ones of a key first."""
-        rows = (Unread(tag, value, len(of), assumed) for (tag, value, assumed), of in self._notes.items())
-        return tuple(sorted(rows, key=lambda row: (row.tag, -row.count, row.value)))
+def unread_rows(notes: Notes) -> tuple[Unread, ...]:
+    """Return the values, sorted by key, the most frequent ones of a key first."""
+    rows = (Unread(tag, value, len(of), assumed) for (tag, value, assumed), of in notes.items())
+    return tuple(sorted(rows, key=lambda row: (row.tag, -row.count, row.value)))
 
 
 @contextmanager
-def unread_table() -> Iterator[UnreadTable]:
+def noting_unread() -> Iterator[Notes]:
     """Collect the notes of the block; those of an import around it are its own."""
-    table = UnreadTable()
-    token = _NOTES.set(table._notes)
+    notes: Notes = {}
+    token = _NOTES.set(notes)
     try:
-        yield table
+        yield notes
     finally:
         _NOTES.reset(token)

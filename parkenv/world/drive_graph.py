@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -124,14 +124,6 @@ class Centrelines:
         leaving = np.stack([begin, -end], axis=1).reshape(-1, 2)
         return Chains(first.ravel(), last.ravel(), leaving, drivable.ravel(), self.node_xy)
 
-    def legs_at(self, station: FloatArray) -> IntArray:
-        leg = np.searchsorted(self.station[self.leg_start], station, side="right") - 1
-        return np.clip(leg, 0, len(self.leg_start) - 1)
-
-    def points_at(self, station: FloatArray, leg: IntArray) -> FloatArray:
-        start = self.leg_start[leg]
-        return self.xy[start] + (station - self.station[start])[:, None] * self.leg_tangent[leg]
-
 
 LaneParts = tuple[FloatArray, bool, float]  # the points of a lane, whether it is one-way, and its speed
 
@@ -165,11 +157,13 @@ def build_drive_graph(
     order = np.lexsort((station * np.where(against, -1.0, 1.0), chain))
     station = _spread(lines, station, segment, chain, order)
 
-    leg = lines.legs_at(station)
+    leg = np.searchsorted(lines.station[lines.leg_start], station, side="right") - 1
+    leg = np.clip(leg, 0, len(lines.leg_start) - 1)
     tangent = lines.leg_tangent[leg] * np.where(against, -1.0, 1.0)[:, None]
     right = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
     offset = np.where(lines.segment_oneway[segment], 0.0, side * LANE_OFFSET)
-    slot_vertex_xy = lines.points_at(station, leg) + offset[:, None] * right
+    start = lines.leg_start[leg]
+    on_lane = lines.xy[start] + (station - lines.station[start])[:, None] * lines.leg_tangent[leg]
 
     along = _chain_edges(lines, station, tangent, chain, order, n_slots)
     along, node = _turning_edges(lines.chains, turns, along, n_slots)
@@ -188,7 +182,7 @@ def build_drive_graph(
     vertex_yaw = np.zeros(n_slots + len(node))
     vertex_yaw[:n_slots] = np.arctan2(tangent[:, 1], tangent[:, 0])
     return DriveGraph(
-        vertex_xy=np.concatenate([slot_vertex_xy, lines.node_xy[node]]),
+        vertex_xy=np.concatenate([on_lane + offset[:, None] * right, lines.node_xy[node]]),
         vertex_yaw=vertex_yaw,
         neighbors=neighbors,
         edge_length=edge_length,
@@ -405,18 +399,15 @@ def _turning_edges(
         )
     if not forbidden:
         return edges, node
-    source, target, *_, of = edges
-    target = target.copy()
-    leaves, ends = source >= n_slots, target >= n_slots
-    for k, chain in enumerate(forbidden):
-        target[ends & (of == chain)] = n_slots + len(node) + k
+    source, target, length, bearing, of = edges
+    target, ends = target.copy(), target >= n_slots
     rows, at = [np.arange(len(source))], [source]
-    for k, (chain, others) in enumerate(forbidden.items()):
-        onward = np.flatnonzero(leaves & (source == n_slots + chains.last[chain]) & ~np.isin(of, others))
+    for own, (chain, others) in enumerate(forbidden.items(), start=n_slots + len(node)):
+        target[ends & (of == chain)] = own
+        onward = np.flatnonzero((source == n_slots + chains.last[chain]) & ~np.isin(of, others))
         rows.append(onward)
-        at.append(np.full(len(onward), n_slots + len(node) + k))
+        at.append(np.full(len(onward), own))
     row = np.concatenate(rows)
-    _, _, length, bearing, _ = edges
     more = (np.concatenate(at), target[row], length[row], bearing[row], of[row])
     return more, np.concatenate([node, chains.last[list(forbidden)]])
 
@@ -558,18 +549,14 @@ def forbidden_after(chains: Chains, turns: Sequence[TurnParts]) -> tuple[dict[in
 
 def connected(chains: Chains, rules: Sequence[Rule]) -> BoolArray:
     """Return which chains are in the largest part in which each leads to every other one, (2n,) bool."""
-    drivable = np.flatnonzero(chains.drivable)
-    out = drivable[np.argsort(chains.first[drivable], kind="stable")]
-    begin, end = (
-        np.searchsorted(chains.first[out], chains.last[drivable], side) for side in ("left", "right")
+    drivable, n = np.flatnonzero(chains.drivable), len(chains.first)
+    ones, shape = np.ones(len(drivable)), (n, len(chains.node_xy))
+    ends, starts = (
+        csr_array((ones, (drivable, nodes[drivable])), shape=shape) for nodes in (chains.last, chains.first)
     )
-    source = np.repeat(drivable, end - begin)
-    target = out[
-        np.arange(len(source)) + np.repeat(begin - np.r_[0, np.cumsum(end - begin)[:-1]], end - begin)
-    ]
-    n = len(chains.first)
+    graph = (ends @ starts.T).tocoo()
     forbidden = np.concatenate([np.empty(0, np.int64), *(rule.chain * n + rule.forbidden for rule in rules)])
-    free = ~np.isin(source * n + target, forbidden)
-    graph = coo_array((np.ones(int(free.sum()), bool), (source[free], target[free])), shape=(n, n))
+    graph.data[np.isin(graph.row.astype(np.int64) * n + graph.col, forbidden)] = 0.0
+    graph.eliminate_zeros()
     part = connected_components(graph, connection="strong")[1]
     return chains.drivable & (part == np.bincount(part[drivable]).argmax())  # type: ignore[no-any-return]

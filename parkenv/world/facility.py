@@ -64,10 +64,8 @@ def nominal_slots(
 ) -> tuple[FloatArray, FloatArray]:
     """Return centres, (n, 2) m, and yaws, (n,) rad, of the slots of counted facilities: beside the nearest lane.
 
-    A slot stands at right angles to its lane, on the side of the facility's point, and is entered from its rear.
-
-    Raises:
-        GraphError: a facility out of reach of all lanes; the message names it.
+    A slot stands at right angles to its lane, on the side of the facility's point, and is entered from its rear. A
+    facility out of reach of all lanes is a GraphError.
     """
     legs = np.concatenate([np.stack([points[:-1], points[1:]], axis=1) for points in lanes])
     tree = shapely.STRtree(linestrings(list(legs)))

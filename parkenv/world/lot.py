@@ -393,11 +393,9 @@ def _add_counted(lot: ParkingLot) -> None:
     names, n = tuple(facility.name for facility in counted), len(lot.slot_ids)
     there = lot.slot_ids[max(n - len(names), 0) :] == names
     drawn = n - len(names) if there else n
-    xy, yaw = (
-        nominal_slots(lot.facilities, [lane.points for lane in lot.lanes])
-        if lot.lanes
-        else (np.zeros((len(counted), 2)), np.zeros(len(counted)))
-    )
+    xy, yaw = np.zeros((len(counted), 2)), np.zeros(len(counted))
+    if lot.lanes:
+        xy, yaw = nominal_slots(lot.facilities, [lane.points for lane in lot.lanes])
     lot._set("slot_ids", lot.slot_ids[:drawn] + names)
     for name, values in (
         ("slot_xy", xy),

@@ -48,20 +48,10 @@ def _content(lot: ParkingLot, seed: int) -> bytes:
 
 def _make_slot_lot(lot: ParkingLot, seed: int) -> SlotLot:
     buildings = [wall[:-1] for wall in lot.walls if is_building(wall)]
-    legs = [
-        [*start, *end, WALL_HEIGHT]
-        for wall in lot.walls
-        if not is_building(wall)
-        for start, end in pairwise(wall)
-    ]
-    slots = SlotLot(
-        lot.slot_xy,
-        lot.slot_yaw,
-        lot.slot_length,
-        lot.slot_width,
-        kerbside=lot.slot_mouth != Mouth.REAR,
-        seed=seed,
-    )
+    open_walls = [wall for wall in lot.walls if not is_building(wall)]
+    legs = [[*start, *end, WALL_HEIGHT] for wall in open_walls for start, end in pairwise(wall)]
+    shapes = (lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width)
+    slots = SlotLot(*shapes, kerbside=lot.slot_mouth != Mouth.REAR, seed=seed)
     lanes = [lane.points for lane in lot.lanes]
     around = slot_surroundings(slots, lanes, buildings=buildings, walls=legs, seed=seed)
     return replace(slots, surroundings=around)

@@ -51,11 +51,7 @@ class Hours:
         """Read hours in OpenStreetMap's notation: `Mo-Fr 08:00-12:00,13:00-18:00; Sa 09:00-13:00`, or `24/7`.
 
         A rule without days is for all of them, `off` empties its days, and a later rule replaces earlier ones on its
-        days. A span across midnight is written as two.
-
-        Args:
-            text: the hours.
-            field: what messages call them.
+        days. A span across midnight is written as two. Messages call the hours as `field` says.
         """
         days: list[tuple[tuple[int, int], ...]] = [()] * 7
         for rule in str(text).replace("24/7", "00:00-24:00").split(";"):
@@ -88,12 +84,7 @@ class Hours:
         return edges, np.r_[0.0, np.cumsum(open_s)]
 
     def within(self, begin_s: ArrayLike, stay_s: ArrayLike) -> FloatArray:
-        """Return how many seconds of stays fall into these hours, (...) s.
-
-        Args:
-            begin_s: (...) s since Monday 00:00.
-            stay_s: (...) s, at least 0; may be infinite.
-        """
+        """Return how many s of stays, (...) s, fall into these hours; begins are s since Monday 00:00."""
         edges, before = self._week
         begin, stay = np.asarray(begin_s, np.float64), np.asarray(stay_s, np.float64)
         known = np.where(np.isfinite(stay), stay, 0.0)
@@ -131,8 +122,7 @@ def _spans(text: str, field: str) -> tuple[tuple[int, int], ...]:
         spans.append((begin, end))
     spans.sort()
     for (_, end), (begin, _) in pairwise(spans):
-        if begin < end:
-            raise InputError(f"{field} has {text!r:.40}, want spans that do not overlap")
+        require(begin >= end, f"{field} has {text!r:.40}, want spans that do not overlap")
     return tuple(spans)
 
 
@@ -229,13 +219,7 @@ class Price(Validated):
         return replace(self, per_hour=beyond, steps=steps)
 
     def amount(self, begin_s: ArrayLike, stay_s: ArrayLike, kwh: ArrayLike = 0.0) -> FloatArray:
-        """Return what stays cost, (...) in the currency.
-
-        Args:
-            begin_s: (...) s since Monday 00:00.
-            stay_s: (...) s, at least 0; may be infinite.
-            kwh: (...) kWh charged.
-        """
+        """Return what stays cost, (...); they are (...) s, may be infinite, and begin at s since Monday 00:00."""
         begin, stay = np.broadcast_arrays(np.asarray(begin_s, np.float64), np.asarray(stay_s, np.float64))
         if self.daily_cap is None:
             cost = self._of(begin, stay)

@@ -58,10 +58,10 @@ class LotTraffic:
         if self._n == 0:
             return
         routes = _Routes(lot, goal)
-        cars = [_car(routes, np.random.default_rng([int(key), _CARS, k]), slots) for k in range(traffic.cars)]
-        people = [
-            _person(routes, np.random.default_rng([int(key), _PEOPLE, k])) for k in range(traffic.pedestrians)
-        ]
+        cars, people = (
+            [make(routes, np.random.default_rng([int(key), kind, k]), slots) for k in range(n)]
+            for kind, make, n in ((_CARS, _car, traffic.cars), (_PEOPLE, _person, traffic.pedestrians))
+        )
         self._loops = _Loops([loop for loop, _ in (*cars, *people)])
         self._models = np.array([number for _, number in cars], dtype=np.int64)
         self._looks = np.array([number for _, number in people], dtype=np.int64)
@@ -152,7 +152,7 @@ def _car(routes: _Routes, rng: np.random.Generator, slots: SlotLot) -> tuple[_Lo
     return loop, int(rng.choice(slots.fitting[int(rng.integers(len(slots.fitting)))]))
 
 
-def _person(routes: _Routes, rng: np.random.Generator) -> tuple[_Loop, int]:
+def _person(routes: _Routes, rng: np.random.Generator, _: SlotLot) -> tuple[_Loop, int]:
     loop = _Loop(routes.walk(rng), 0.5, rng.uniform(*WALK_SPEEDS), rng.uniform(-0.4, 0.9), rng.random())
     return loop, int(rng.integers(1 << 30))
 

@@ -150,22 +150,15 @@ def kerb_slots_of(register: Register, roads: Sequence[Road], frame: LocalFrame) 
     leave_out(
         legs.nearest_crossing(slots.mouths(), leg) <= own, "bays nearer to a street that crosses theirs"
     )
-    leave_out(legs.are_near(slots.boxes(), ON_IT), "bays on a street")
+    on_it = legs.tree.query(slots.boxes(), predicate="dwithin", distance=ON_IT)[0]
+    leave_out(np.isin(np.arange(len(slots)), on_it), "bays on a street")
     index = np.flatnonzero(reasons == 0)
     reasons[index[~without_overlaps(slots.boxes(OVERLAP)[index])]] = "bays at the place of another one"
     index = np.flatnonzero(reasons == 0)
-    ids = np.array(places.ids, np.object_)
-    lost = {
-        str(reason): ids[reasons == reason].tolist() for reason in dict.fromkeys(reasons.tolist()) if reason
-    }
-    return KerbSlots(
-        slots[index],
-        ids[index].tolist(),
-        places.bay[index],
-        road[index],
-        is_left[index],
-        LeftOut.by_reason(lost),
-    )
+    named = dict.fromkeys(filter(None, reasons.tolist()))
+    left_out = LeftOut.by_reason({reason: places.ids[reasons == reason].tolist() for reason in named})
+    ids = places.ids[index].tolist()
+    return KerbSlots(slots[index], ids, places.bay[index], road[index], is_left[index], left_out)
 
 
 def _spacing(kerb: IntArray, station: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -218,29 +211,20 @@ class _Legs:
         run = np.clip(ahead, 0.0, self.length[leg])
         return run, ahead - run, along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0]
 
-    def are_near(self, shapes: NDArray[np.object_], distance: float) -> BoolArray:
-        near = np.zeros(len(shapes), bool)
-        near[self.tree.query(shapes, predicate="dwithin", distance=distance)[0]] = True
-        return near
-
     def serving(self, places: _Places, streets: NDArray[np.object_]) -> IntArray:
         """Return the leg at which each place is, (n,); -1: none."""
         place, leg = self.tree.query(shapely.points(places.xy), predicate="dwithin", distance=REACH)
         cost = np.hypot(*self.at(leg, places.xy[place])[1:]) + SERVICE_MALUS * self.is_service[leg]
         axis = places.axis[place]
-        turn = np.arcsin(
-            np.clip(np.abs(axis[:, 0] * self.along[leg, 1] - axis[:, 1] * self.along[leg, 0]), 0.0, 1.0)
-        )
+        sine = np.abs(axis[:, 0] * self.along[leg, 1] - axis[:, 1] * self.along[leg, 0])
+        turn = np.arcsin(np.clip(sine, 0.0, 1.0))
         # Outlines may be along their street or across it.
         is_drawn = np.isfinite(places.size[place, 0])
         cost += BEARING_MALUS / (np.pi / 4) * np.where(is_drawn, np.minimum(turn, np.pi / 2 - turn), turn)
         names, of_bay = np.unique(streets.astype(str), return_inverse=True)
-        pairs, which = np.unique(
-            np.stack([of_bay[places.bay[place]], self.road[leg]]), axis=1, return_inverse=True
-        )
-        alike = [
-            not _words(str(names[i])).isdisjoint(_words(str(self.names[k]))) for i, k in pairs.T.tolist()
-        ]
+        both = np.stack([of_bay[places.bay[place]], self.road[leg]])
+        pairs, which = np.unique(both, axis=1, return_inverse=True)
+        alike = [bool(_words(str(names[i])) & _words(str(self.names[k]))) for i, k in pairs.T.tolist()]
         cost -= NAME_BONUS * np.array(alike, np.float64)[which]
         order = np.lexsort((leg, cost, place))
         own, first = np.unique(place[order], return_index=True)

@@ -19,7 +19,7 @@ import shapely.geometry
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, IntArray
-from parkenv.errors import InputError, naming, nearest
+from parkenv.errors import InputError, naming, nearest, require
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import csv_records, read_json, unpacked_path
 from parkenv.files.option import columns_in
@@ -73,10 +73,9 @@ class Register:
     def within(self, box: Box) -> Self:
         at = shapely.get_coordinates(shapely.centroid(self.shapes))[:, ::-1]
         inside = ((at >= np.min(box, axis=0)) & (at <= np.max(box, axis=0))).all(axis=1)
-        if not inside.any():
-            raise InputError(
-                f"no bay of the register lies within latitudes and longitudes {box[0]} to {box[1]}"
-            )
+        require(
+            inside.any(), f"no bay of the register lies within latitudes and longitudes {box[0]} to {box[1]}"
+        )
         return self.part(inside)
 
     def box(self, margin: float) -> Box:
@@ -89,20 +88,14 @@ class Register:
 
 
 def read_bays(path: str | Path, columns: str | None = None) -> Register:
-    """Read a register of bays.
+    """Read a register of bays, `.csv`, `.json` or `.geojson`, also packed as `.gz` and `.bz2`.
 
-    Args:
-        path: `.csv`, `.json` or `.geojson`, also packed as `.gz` and `.bz2`.
-        columns: names of columns by part (`SYNONYMS`), see `columns_in`.
-
-    Raises:
-        InputError: the file cannot be read, or has no position or no bay.
+    Names of `columns` are by part (`SYNONYMS`), see `columns_in`.
     """
     path = Path(path)
     with naming(path):
         records = list(_records(path))
-        if not records:
-            raise InputError("has no bay, want a row or a feature for each")
+        require(records, "has no bay, want a row or a feature for each")
         names = list(dict.fromkeys(name for _, record, _ in records for name in record))
         own = dict(_usual(tuple(names)))
         for part, chosen in columns_in(columns).items():
@@ -110,11 +103,11 @@ def read_bays(path: str | Path, columns: str | None = None) -> Register:
             for name, known in ((part, list(SYNONYMS)), *((name, names) for name in chosen)):
                 if name not in known:
                     raise InputError(f"--columns has {name!r:.40}; {nearest(name, known)}")
-        if not own.keys() & {"line", "lat"} and unpacked_path(path).suffix.lower() == ".csv":
-            raise InputError(
-                f"no position in its columns {', '.join(names)[:400]}; want --columns bay=ID,lat=LATITUDE,"
-                "lon=LONGITUDE or line=POSITIONS"
-            )
+        require(
+            own.keys() & {"line", "lat"} or unpacked_path(path).suffix.lower() != ".csv",
+            f"no position in its columns {', '.join(names)[:400]}; want --columns bay=ID,lat=LATITUDE,"
+            "lon=LONGITUDE or line=POSITIONS",
+        )
         return _register(records, own)
 
 

@@ -20,7 +20,7 @@ import shapely
 from pydantic import ConfigDict, Field, Strict
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, naming, nearest, require_number
+from parkenv.errors import InputError, naming, nearest, require, require_number
 from parkenv.files.file_names import is_plain
 from parkenv.files.spec_file import Spec
 from parkenv.lots.generators import NO_SLOTS, Slots, slots_from_polygons
@@ -182,8 +182,7 @@ def read_zones(document: Any) -> dict[str, Zone]:
     rules = {}
     for name, given in document.items():
         with naming(f"zone {name!a:.40}"):
-            if not name or not is_plain(name):
-                raise InputError("its name is empty or has control characters")
+            require(name and is_plain(name), "its name is empty or has control characters")
             members = members_of(given, ("price", "hours", "max_stay_s", "users"), "rules")
             if "price" in members:
                 members["price"] = Price.parse(members["price"])
@@ -227,8 +226,7 @@ def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray
                 absent = [member for member in _COUNTED if member in given and not given.get("capacity")]
                 if absent:
                     raise InputError(f"{absent[0]} is of counted facilities, want a capacity, too")
-                if str(name) in seen:
-                    raise InputError("its name appears already")
+                require(str(name) not in seen, "its name appears already")
                 contents.facilities.append(
                     Facility(
                         name=name,
@@ -258,8 +256,7 @@ def facility_properties(facility: Facility) -> dict[str, Any]:
 
 def read_weights(feature: RawFeature) -> dict[str, float]:
     weights = feature.properties.get("weights", {})
-    if not isinstance(weights, dict):
-        raise InputError(f"{feature.kind}: weights is {weights!r:.40}, want numbers by purpose")
+    require(isinstance(weights, dict), f"{feature.kind}: weights is {weights!r:.40}, want numbers by purpose")
     for purpose, weight in weights.items():
         require_number(f"{feature.kind}: weights[{purpose!r:.40}]", weight, least=0.0)
     return {purpose: float(weight) for purpose, weight in weights.items()}
@@ -308,8 +305,7 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
                 raise InputError(f"slot: id {slot_id!r:.40} appears already in feature {first_with[slot_id]}")
             first_with[slot_id] = feature.number
             with naming(f"slot {slot_id!r:.40}"):
-                if area[i] < SLOT_SIDE**2:
-                    raise InputError("the polygon is flat, want an area to park on")
+                require(area[i] >= SLOT_SIDE**2, "the polygon is flat, want an area to park on")
                 if not valid[i]:
                     reason = shapely.is_valid_reason(polygons[i])
                     raise InputError(f"the polygon is not a simple one: {reason}")

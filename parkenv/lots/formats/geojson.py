@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, with_extra
+from parkenv.errors import InputError, require, with_extra
 from parkenv.files.atomic_write import check_writable, write_text
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
@@ -110,8 +110,7 @@ def check_lot_output(path: Path) -> None:
 
 
 def _check_suffix(path: Path) -> None:
-    if path.suffix.lower() not in (".geojson", ".json"):
-        raise InputError(f"{path}: a lot is written as .geojson or .json")
+    require(path.suffix.lower() in (".geojson", ".json"), f"{path}: a lot is written as .geojson or .json")
 
 
 def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
@@ -120,31 +119,21 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
         return {"type": "Feature", "properties": properties, "geometry": shape}
 
     rings = np.round(lot.slot_corners()[:, [0, 1, 2, 3, 0]], 3).tolist()
-    shapes = zip(
-        lot.slot_xy.tolist(),
-        lot.slot_yaw.tolist(),
-        lot.slot_length.tolist(),
-        lot.slot_width.tolist(),
-        (Mouth(mouth).name.lower() for mouth in lot.slot_mouth),
-        strict=True,
+    shapes = (lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width)
+    exact = zip(
+        *(column.tolist() for column in shapes), (Mouth(m).name.lower() for m in lot.slot_mouth), strict=True
     )
-    columns = zip(
-        lot.slot_ids,
-        rings,
-        shapes,
-        lot.slot_parking_cost_s.tolist(),
-        lot.slot_zone.tolist(),
-        lot.slot_facility.tolist(),
-        lot.is_counted.tolist(),
-        strict=True,
+    more = zip(
+        lot.slot_parking_cost_s.tolist(), lot.slot_zone.tolist(), lot.slot_facility.tolist(), strict=True
     )
-    for slot_id, ring, shape, cost, zone, facility, is_counted in columns:
-        if is_counted:
-            continue  # Its facility says all of it.
-        exact = dict(zip(SLOT_SHAPE, shape, strict=True))
-        given = {"parking_cost_s": cost, "zone": zone, "facility": facility}
-        given = {name: value for name, value in given.items() if value}
-        yield feature("Polygon", [ring], kind="slot", id=slot_id, **given, **exact)
+    slots = zip(lot.slot_ids, rings, exact, more, lot.is_counted.tolist(), strict=True)
+    for slot_id, ring, shape, own, is_counted in slots:
+        if not is_counted:  # else its facility says all of it
+            named = zip(("parking_cost_s", "zone", "facility"), own, strict=True)
+            given = {name: value for name, value in named if value} | dict(
+                zip(SLOT_SHAPE, shape, strict=True)
+            )
+            yield feature("Polygon", [ring], kind="slot", id=slot_id, **given)
     for lane in lot.lanes:
         given = {} if lane.speed == 1.0 else {"speed": lane.speed}
         yield feature("LineString", lane.points.tolist(), kind="lane", oneway=lane.oneway, **given)
@@ -178,17 +167,16 @@ def read_contents(path: Path) -> LotContents:
     """Read all valid features of a file, and record all errors. Does not raise."""
     contents = LotContents(path.stem)
     try:
-        if path.suffix.lower() not in (".geojson", ".json"):
-            raise InputError(
-                f"unknown kind of file {path.suffix!r}, want .geojson, .json or a Dragon Lake .yml"
-            )
+        require(
+            path.suffix.lower() in (".geojson", ".json"),
+            f"unknown kind of file {path.suffix!r}, want .geojson, .json or a Dragon Lake .yml",
+        )
         document = read_json(path)
         contents.name = _check_head(document, path.stem)
         system = Positions(True) if "frame" in document else Positions.of(document)
         contents.found = system.found
         traffic = document.get("traffic", "right")
-        if traffic not in ("left", "right"):
-            raise InputError(f"traffic is {traffic!r:.40}, want 'left' or 'right'")
+        require(traffic in ("left", "right"), f"traffic is {traffic!r:.40}, want 'left' or 'right'")
         contents.left_hand = traffic == "left"
         contents.zone_rules = read_zones(document.get("zones", {}))
     except InputError as error:
@@ -235,30 +223,31 @@ def read_contents(path: Path) -> LotContents:
     return contents
 
 
+_OPTIONS = {"lane": (Lane, ("oneway", "speed")), "turn": (Turn, ("only",))}
+"""Classes of features that are lines, and their properties, which all may be absent."""
+
+
 def _add_feature(contents: LotContents, feature: RawFeature, parts: list[FloatArray]) -> None:
-    if feature.kind in ("lane", "turn"):
-        names = ("oneway", "speed") if feature.kind == "lane" else ("only",)
-        given = {name: value for name in names if (value := feature.properties.get(name)) is not None}
-        try:
-            if feature.kind == "lane":
-                contents.lanes.append(Lane(parts[0], **given))
-            else:
-                contents.turns.append(Turn(parts[0], **given))
-        except InputError as error:
-            contents.error(feature.number, str(error))
-            return
-    elif feature.kind == "wall":
-        contents.walls += parts
+    lists: dict[str, list[Any]] = {
+        "lane": contents.lanes,
+        "turn": contents.turns,
+        "entry": contents.entries,
+        "goal": contents.goals,
+    }
+    try:
+        if feature.kind == "wall":
+            contents.walls += parts
+        elif feature.kind in _OPTIONS:
+            made, names = _OPTIONS[feature.kind]
+            given = {name: value for name in names if (value := feature.properties.get(name)) is not None}
+            lists[feature.kind].append(made(parts[0], **given))
+        else:
+            contents.weights[feature.kind].append(read_weights(feature))
+            lists[feature.kind].append(parts[0][0])
+    except InputError as error:
+        contents.error(feature.number, str(error))
     else:
-        try:
-            weights = read_weights(feature)
-        except InputError as error:
-            contents.error(feature.number, str(error))
-            return
-        contents.weights[feature.kind].append(weights)
-        points = contents.entries if feature.kind == "entry" else contents.goals
-        points.append(parts[0][0])
-    contents.numbers[feature.kind].append(feature.number)
+        contents.numbers[feature.kind].append(feature.number)
 
 
 def _check_head(document: Any, stem: str) -> str:
@@ -272,9 +261,8 @@ def _check_head(document: Any, stem: str) -> str:
     header = document.get("parkenv", {"format": "lot", "version": LOT_VERSION})
     if not isinstance(header, dict) or header.get("format") != "lot":
         raise InputError(f'parkenv is {header!r:.60}, want {{"format": "lot", "version": {LOT_VERSION}}}')
-    version = header.get("version")
-    if type(version) is not int or version < 1:
-        raise InputError(f"parkenv.version is {version!r:.40}, want {LOT_VERSION}")
+    version: Any = header.get("version")
+    require(type(version) is int and version >= 1, f"parkenv.version is {version!r:.40}, want {LOT_VERSION}")
     if version > LOT_VERSION:
         raise InputError(f"parkenv.version is {version}, want {LOT_VERSION}: made by a newer parkenv")
     name = document.get("name", stem)
@@ -297,8 +285,7 @@ def _check_feature(
     if not isinstance(kind, str) or kind not in KINDS:
         raise InputError(f"kind is {kind!r:.40}, want one of {', '.join(KINDS)}")
     kinds_seen.add(kind)
-    if shape not in KINDS[kind]:
-        raise InputError(f"{kind}: geometry is {shape!r:.40}, want {' or '.join(KINDS[kind])}")
+    require(shape in KINDS[kind], f"{kind}: geometry is {shape!r:.40}, want {' or '.join(KINDS[kind])}")
     for of, name in (("lane", "oneway"), ("turn", "only")):
         if kind == of and not isinstance(properties.get(name, False), bool):
             raise InputError(f"{kind}: {name} is {properties[name]!r:.40}, want true or false")
@@ -313,8 +300,7 @@ def _check_feature(
         lines, least = coordinates, 4
     if not isinstance(lines, list) or not lines:
         raise InputError(f"{kind}: coordinates are {lines!r:.40}, want a list of rings")
-    if kind == "slot" and len(lines) > 1:
-        raise InputError(f"slot: the polygon has {len(lines)} rings, want 1")
+    require(kind != "slot" or len(lines) == 1, f"slot: the polygon has {len(lines)} rings, want 1")
     parts = []
     for line in lines:
         if not isinstance(line, list) or len(line) < least:
@@ -377,10 +363,10 @@ class Positions:
             xy = np.concatenate([*rings, np.empty((0, 2))])
             there_and_back = grid[0].transform(*grid[0].transform(xy[:, 0], xy[:, 1]), direction="INVERSE")
             # Far beyond a grid's own area a projection repeats itself.
-            if not np.allclose(there_and_back, xy.T, rtol=0.0, atol=1.0):
-                raise InputError(
-                    f"crs is {grid[1]}, in which the positions lie nowhere on the globe; {_ADVICE}"
-                )
+            require(
+                np.allclose(there_and_back, xy.T, rtol=0.0, atol=1.0),
+                f"crs is {grid[1]}, in which the positions lie nowhere on the globe; {_ADVICE}",
+            )
             return cls(found=f"positions are in {grid[1]}, as the file's crs says", grid=grid[0])
         if document.get("crs") is not None:
             return cls()  # degrees, as it says

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, require
 from parkenv.files.field_types import Name
 from parkenv.files.limited_reading import csv_records
 from parkenv.files.spec_file import Spec
@@ -70,8 +70,7 @@ def read_slot_list(path: str | Path) -> SlotList:
             if given not in (["x", "y"], ["lat", "lon"]):
                 raise InputError(f"columns are {','.join(record)!r:.80}, want x,y or lat,lon")
         rows[name] = row
-    if not rows:
-        raise InputError(f"{path}: no slot below the line of columns")
+    require(rows, f"{path}: no slot below the line of columns")
     frame = None
     if row.lat is None:
         points = np.array([(row.x, row.y) for row in rows.values()], np.float64)
@@ -97,8 +96,7 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
     box = options.box(listed.frame)
     if box is not None:
         inside = np.asarray(((listed.xy >= box[:2]) & (listed.xy <= box[2:])).all(axis=1))
-        if not inside.any():
-            raise InputError(f"{path}: no slot within the bounds {', '.join(f'{b:g}' for b in box)} m")
+        require(inside.any(), f"{path}: no slot within the bounds {', '.join(f'{b:g}' for b in box)} m")
         ids = tuple(name for name, is_inside in zip(listed.ids, inside.tolist(), strict=True) if is_inside)
         columns = ("xy", "yaw", "parking_cost_s", "zone")
         some = {name: values[inside] for name in columns if (values := getattr(listed, name)) is not None}

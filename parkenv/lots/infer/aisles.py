@@ -220,31 +220,26 @@ def _least_cost(unary: FloatArray, members: IntArray, pairs: dict[tuple[int, int
             cost = cost + table[sides[..., a], sides[..., b]]
         return cost
 
-    if not len(free):
-        return np.asarray(fixed)
     if len(free) <= EXHAUSTIVE:
         sides = np.tile(fixed, (2 ** len(free), 1))
-        sides[:, free] = np.array(list(product((0, 1), repeat=len(free))), dtype=int).reshape(-1, len(free))
+        sides[:, free] = np.array(list(product((0, 1), repeat=len(free))), dtype=int)
         return np.asarray(sides[int(np.argmin(total(sides)))])
-    best, best_cost = fixed, np.inf
     groups = [[i] for i in free.tolist()] + [[a, b] for a, b, _ in tables if a in free and b in free]
-    for value in (None, 0, 1):
+    changes = [(group, values) for group in groups for values in product((0, 1), repeat=len(group))]
+    found = []
+    for start in (fixed[free], 0, 1):
         sides = fixed.copy()
-        if value is not None:
-            sides[free] = value
+        sides[free] = start
         cost, changed = float(total(sides)), True
         while changed:
             changed = False
-            for group in groups:
-                for values in product((0, 1), repeat=len(group)):
-                    trial = sides.copy()
-                    trial[group] = values
-                    trial_cost = float(total(trial))
-                    if trial_cost < cost - 1e-9:
-                        sides, cost, changed = trial, trial_cost, True
-        if cost < best_cost:
-            best, best_cost = sides, cost
-    return np.asarray(best)
+            for group, values in changes:
+                trial = sides.copy()
+                trial[group] = values
+                if (trial_cost := float(total(trial))) < cost - 1e-9:
+                    sides, cost, changed = trial, trial_cost, True
+        found.append((cost, sides))
+    return np.asarray(min(found, key=lambda pair: pair[0])[1])
 
 
 HALF_WIDTH = 3.0  # distance, m, of the centre line from a row that no other row faces
@@ -319,12 +314,10 @@ def _faced(rows: Sequence[OpenRow], owner: IntArray, r: int) -> IntArray:
     normal = own.row.normal(own.side)
     for k, hit in enumerate(own.view.hit.tolist()):
         q = int(owner[hit]) if hit >= 0 else -1
-        if q < 0 or q == r or own.view.clear[k] > WIDEST_SHARED:
-            continue
-        other = rows[q]
-        j = int(np.flatnonzero(other.row.members == hit)[0])
-        if normal[k] @ other.row.normal(other.side)[j] < -0.9:
-            result[k] = q
+        if q >= 0 and q != r and own.view.clear[k] <= WIDEST_SHARED:
+            j = int(np.flatnonzero(rows[q].row.members == hit)[0])
+            if normal[k] @ rows[q].row.normal(rows[q].side)[j] < -0.9:
+                result[k] = q
     return result
 
 
@@ -419,10 +412,8 @@ def _curve(xy: FloatArray, half: float) -> FloatArray:
         left &= ~near
     nodes = np.array(middles)
     if len(nodes) < 3:
-        far = np.unravel_index(
-            np.argmax(np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))), (len(xy),) * 2
-        )
-        line = xy[list(far)]
+        apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+        line = xy[list(np.unravel_index(np.argmax(apart), apart.shape))]
         if np.hypot(*(line[1] - line[0])) < 0.5:
             line = line + np.array([[-half, 0.0], [half, 0.0]])
         return _lengthened(line, half)
@@ -495,22 +486,17 @@ def _extended(aisles: Sequence[Aisle], tree: shapely.STRtree) -> list[Aisle]:
     crossing = shapely.STRtree(lines)
     extended = []
     for a, aisle in enumerate(aisles):
-        points = aisle.points
-        for end in (0, -1):
-            inner = points[1] if end == 0 else points[-2]
-            way = (points[end] - inner) / np.hypot(*(points[end] - inner))
+        points = aisle.points.copy()
+        for end, inner in ((0, 1), (-1, -2)):
+            way = (points[end] - points[inner]) / np.hypot(*(points[end] - points[inner]))
             free = _free_length(points[end], way, MEETING, tree)
             probe = shapely.LineString([points[end], points[end] + free * way])
-            meets = [
-                shapely.distance(shapely.Point(points[end]), shapely.intersection(probe, lines[b]))
-                for b in crossing.query(probe, predicate="intersects").tolist()
-                if b != a
-            ]
-            length = min(meets) if meets else min(BEYOND, free)
+            others = np.setdiff1d(crossing.query(probe, predicate="intersects"), [a])
+            meets = shapely.distance(shapely.Point(points[end]), shapely.intersection(probe, lines[others]))
+            length = meets.min() if len(others) else min(BEYOND, free)
             if length > 0.05:
-                tip = points[end] + length * way
-                points = np.concatenate([[tip], points[1:]] if end == 0 else [points[:-1], [tip]])
-        extended.append(Aisle(points, aisle.rows, aisle.width, aisle.one_way))
+                points[end] += length * way
+        extended.append(replace(aisle, points=points))
     return extended
 
 

@@ -137,11 +137,9 @@ def _large_enough(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[list[OpenRow
     for part in rows:
         members, kerbside = part.row.members, part.row.kerbside
         fits = spaces.length[members] >= KERB_LENGTH if kerbside else spaces.width[members] >= NARROWEST
-        reason = (
-            f"kerbside spaces shorter than {KERB_LENGTH:g} m"
-            if kerbside
-            else f"spaces narrower than {NARROWEST:g} m"
-        )
+        reason = f"spaces narrower than {NARROWEST:g} m"
+        if kerbside:
+            reason = f"kerbside spaces shorter than {KERB_LENGTH:g} m"
         small.setdefault(reason, []).extend(members[~fits].tolist())
         if fits.any():
             index = np.flatnonzero(fits)
@@ -234,11 +232,9 @@ def draft_inferred_lot(
 
 def _found(lot: InferredLot, n: int, unit: str, frame: LocalFrame | None) -> Iterator[str]:
     rows = lot.rows
-    kinds = {"kerbside": 0, "oblique": 0, "perpendicular": 0}
-    for part in rows:
-        slant = np.degrees(part.row.slant)
-        kinds["kerbside" if slant < 15 else "oblique" if slant < 75 else "perpendicular"] += 1
-    listed = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
+    slants = np.digitize(np.degrees([part.row.slant for part in rows]), (15.0, 75.0)).tolist()
+    kinds = enumerate(("kerbside", "oblique", "perpendicular"))
+    listed = ", ".join(f"{slants.count(k)} {kind}" for k, kind in kinds if k in slants)
     yield f"slots: {len(lot.index)} of {n} {unit}, in rows ({len(rows)}): {listed}"
     wide = [aisle.width for aisle in lot.aisles if aisle.width < 2 * SLOT_REACH]
     width = f", {min(wide):.1f} to {max(wide):.1f} m wide" if wide else ""
@@ -253,49 +249,50 @@ def _guesses_and_issues(
     """Return a sentence for each guess, and what may be wrong; `unused` spaces beside the n were not inferred from."""
     unsure = [part for part in lot.rows if part.certainty < SHARE_UNSURE]
     either = f"; {len(unsure)} could open to either side" if unsure else ""
-    guesses = [
-        f"open sides of rows ({len(lot.rows)}): where the ground in front is free and rows share aisles{either}"
-    ]
-    issues: list[QualityIssue] = []
-
-    def note(count: float, guess: str = "", reason: str = "", error_probability: float = 0.0) -> None:
-        if count and guess:
-            guesses.append(guess)
-        if count and reason:
-            issues.append(QualityIssue(reason, error_probability))
-
     doubt = float(sum(len(p.row) * (SHARE_UNSURE - p.certainty) / SHARE_UNSURE for p in unsure))
-    note(doubt, "", "rows could open to either side", min(0.6, 0.6 * doubt / n + 0.02))
     lost = sum(map(len, lot.left_out.values())) + unused
-    note(lost, "", f"{unit} left out", min(0.5, 1.5 * lost / (n + unused)))
-    note(len(lot.aisles), f"aisles along the rows' fronts: {len(lot.aisles)}")
     reach = [shapely.LineString(c.points).length for c in lot.connections]
-    longest = max(reach, default=0.0)
-    note(len(reach), f"connections through free ground: {len(reach)}, the longest {longest:.0f} m")
-    far = sum(length for length in reach if length > 40.0)
-    note(far, "", "long connections through unknown ground", min(0.4, 0.002 * far + 0.05))
+    longest, far = max(reach, default=0.0), sum(length for length in reach if length > 40.0)
     narrow = sum(c.clearance < TWO_WAY_WIDTH / 2 - 0.05 for c in lot.connections)
-    note(
-        narrow,
-        f"connections narrower than {TWO_WAY_WIDTH:g} m, two-way nevertheless: {narrow}",
-        "narrow connections",
-        min(0.3, 0.05 * narrow),
-    )
-    one_way = sum(aisle.one_way != 0 for aisle in lot.aisles) - len(lot.two_way)
-    note(one_way, f"aisles one-way by the slant of their spaces: {one_way}")
     two_way = len(lot.two_way)
-    no_way = "aisles two-way against the slant of their spaces, as no other way leads back"
-    note(two_way, f"{no_way}: {two_way}", "oblique rows on two-way aisles", 0.15)
-    wider = f"kerbside spaces narrower than {KERB_WIDTH:g} m, widened towards the lane: {lot.widened}"
-    note(lot.widened, wider)
+    one_way = sum(aisle.one_way != 0 for aisle in lot.aisles) - two_way
     tight = sum(len(p.row) for p in lot.rows if np.median(p.view.clear) < least_aisle(p.row) + 0.4)
-    note(tight, "", "narrow aisles", min(0.4, 0.5 * tight / n))
-    if lot.entry is not None and not options.entries:
-        x, y = lot.entries[0].tolist()
-        note(options.guess_entry, f"entry at {x:.1f}, {y:.1f} m: {lot.entry.reason}")
-        note(1, "", "the entry is a guess", 0.05 + 0.1 * (1.0 - lot.entry.certainty))
-    note(bool(goal_note) and not options.goals, f"goal: {goal_note}")
-    return guesses, issues
+    is_guess = lot.entry is not None and not options.entries
+    why, certainty = ("", 1.0) if lot.entry is None else (lot.entry.reason, lot.entry.certainty)
+    x, y = lot.entries[0].tolist()
+    guesses: tuple[tuple[float, str], ...] = (
+        (
+            1,
+            f"open sides of rows ({len(lot.rows)}): where the ground in front is free and rows share aisles{either}",
+        ),
+        (len(lot.aisles), f"aisles along the rows' fronts: {len(lot.aisles)}"),
+        (len(reach), f"connections through free ground: {len(reach)}, the longest {longest:.0f} m"),
+        (narrow, f"connections narrower than {TWO_WAY_WIDTH:g} m, two-way nevertheless: {narrow}"),
+        (one_way, f"aisles one-way by the slant of their spaces: {one_way}"),
+        (
+            two_way,
+            f"aisles two-way against the slant of their spaces, as no other way leads back: {two_way}",
+        ),
+        (
+            lot.widened,
+            f"kerbside spaces narrower than {KERB_WIDTH:g} m, widened towards the lane: {lot.widened}",
+        ),
+        (is_guess and options.guess_entry, f"entry at {x:.1f}, {y:.1f} m: {why}"),
+        (bool(goal_note) and not options.goals, f"goal: {goal_note}"),
+    )
+    issues: tuple[tuple[float, str, float], ...] = (
+        (doubt, "rows could open to either side", min(0.6, 0.6 * doubt / n + 0.02)),
+        (lost, f"{unit} left out", min(0.5, 1.5 * lost / (n + unused))),
+        (far, "long connections through unknown ground", min(0.4, 0.002 * far + 0.05)),
+        (narrow, "narrow connections", min(0.3, 0.05 * narrow)),
+        (two_way, "oblique rows on two-way aisles", 0.15),
+        (tight, "narrow aisles", min(0.4, 0.5 * tight / n)),
+        (is_guess, "the entry is a guess", 0.05 + 0.1 * (1.0 - certainty)),
+    )
+    return (
+        [guess for count, guess in guesses if count],
+        [QualityIssue(reason, error) for count, reason, error in issues if count],
+    )
 
 
 def _missing(lot: InferredLot, entries: FloatArray, goals: FloatArray) -> Iterator[str]:

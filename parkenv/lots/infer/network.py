@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import networkx as nx
 import numpy as np
@@ -14,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.world.drive_graph import NODE_TOLERANCE, node_labels
+from parkenv.world.drive_graph import NODE_TOLERANCE, component_labels, node_labels
 from parkenv.world.lot import MOVES, Lane
 
 STREET = -2  # source of a public street
@@ -39,11 +41,10 @@ def noded(lines: Sequence[Line]) -> list[Line]:
     points = _joined_ends([np.round(line.points / GRID) * GRID for line in lines])
     lines = [line for line, part in zip(lines, points, strict=True) if len(part) > 1]
     original = np.array([shapely.LineString(part) for part in points if len(part) > 1])
-    merged = shapely.union_all(original, grid_size=GRID)
-    pieces = [part for part in shapely.get_parts(merged) if part.length > GRID]
+    pieces = shapely.get_parts(shapely.union_all(original, grid_size=GRID))
     # Where lines coincide, the one that is one-way decides, then the first.
     result = []
-    for piece in pieces:
+    for piece in (piece for piece in pieces if piece.length > GRID):
         probes = shapely.line_interpolate_point(piece, np.linspace(0.0, 1.0, 5), normalized=True)
         distance = shapely.distance(original[:, None], probes[None]).max(axis=1)
         near = np.flatnonzero(distance <= distance.min() + 0.03)
@@ -58,18 +59,14 @@ def noded(lines: Sequence[Line]) -> list[Line]:
 
 
 def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
-    ends = [(k, end) for k in range(len(points)) for end in (0, -1)]
     nodes: list[FloatArray] = []
     users: list[list[tuple[int, int]]] = []
-    for k, end in ends:
+    for k, end in ((k, end) for k in range(len(points)) for end in (0, -1)):
         here = points[k][end]
-        near = [
-            (float(np.hypot(*(node - here))), n)
-            for n, node in enumerate(nodes)
-            if all(other != k for other, _ in users[n])
-        ]
-        if near and min(near)[0] <= LOOSE:
-            users[min(near)[1]].append((k, end))
+        is_other = [all(other != k for other, _ in own) for own in users]
+        away = [np.hypot(*(xy - here)) if ok else np.inf for xy, ok in zip(nodes, is_other, strict=True)]
+        if min(away, default=np.inf) <= LOOSE:
+            users[int(np.argmin(away))].append((k, end))
         else:
             nodes.append(here)
             users.append([(k, end)])
@@ -78,19 +75,13 @@ def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
     tree = shapely.STRtree(shapes)
     corners: dict[int, list[FloatArray]] = {}
     for n, node in enumerate(nodes):
-        here = shapely.Point(node)
-        own = {k for k, _ in users[n]}
-        near = [
-            (round(float(shapely.distance(here, shapes[j])), 6), j)
-            for j in tree.query(here, predicate="dwithin", distance=LOOSE).tolist()
-            if j not in own
-        ]
+        here, own = shapely.Point(node), {k for k, _ in users[n]}
+        around = tree.query(here, predicate="dwithin", distance=LOOSE).tolist()
+        near = [(round(shapes[j].distance(here), 6), j) for j in around if j not in own]
         if near:
             j = min(near)[1]
-            at = shapely.get_coordinates(shapely.line_interpolate_point(shapes[j], shapes[j].project(here)))[
-                0
-            ]
-            nodes[n] = np.round(at / GRID) * GRID
+            at = shapely.line_interpolate_point(shapes[j], shapes[j].project(here))
+            nodes[n] = np.round(shapely.get_coordinates(at)[0] / GRID) * GRID
             corners.setdefault(j, []).append(nodes[n])
     moved = [part.copy() for part in points]
     for node, ends_there in zip(nodes, users, strict=True):
@@ -104,29 +95,21 @@ def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
 
 
 def without_stubs(lines: Sequence[Line], count_served: Callable[[Sequence[Line]], int]) -> list[Line]:
-    kept = list(lines)
+    kept, needed = list(lines), set[int]()
     served = count_served(kept)
-    needed: set[int] = set()
-    while len(kept) > 1:
-        label = node_labels(np.concatenate([line.points[[0, -1]] for line in kept]))
-        degree = np.bincount(label)[label].reshape(-1, 2)
-        stubs = [
-            (length, k)
-            for k, line in enumerate(kept)
-            if degree[k].min() == 1
-            and id(line) not in needed
-            and (length := shapely.LineString(line.points).length) < SHORTEST_STUB
-        ]
-        if not stubs:
-            break
-        k = min(stubs)[1]
+    while True:
+        label = _end_nodes(kept)
+        dead = np.flatnonzero((np.bincount(label.ravel())[label] == 1).any(axis=1)).tolist()
+        length = {k: shapely.LineString(kept[k].points).length for k in dead if id(kept[k]) not in needed}
+        k = min(length, key=lambda k: (length[k], k), default=-1)
+        if len(kept) == 1 or k < 0 or length[k] >= SHORTEST_STUB:
+            return kept
         without = kept[:k] + kept[k + 1 :]
         left = count_served(without)
         if left >= served:
             kept, served = without, left
         else:
             needed.add(id(kept[k]))
-    return kept
 
 
 def directed(lines: Sequence[Line], wanted: dict[int, int]) -> tuple[list[Line], list[int]]:
@@ -136,43 +119,36 @@ def directed(lines: Sequence[Line], wanted: dict[int, int]) -> tuple[list[Line],
     """
     refused = []
     chosen = {k for k, line in enumerate(lines) if line.one_way and line.source < 0}
-    groups = {a: [k for k, line in enumerate(lines) if line.one_way and line.source == a] for a in wanted}
-    label = node_labels(np.concatenate([line.points[[0, -1]] for line in lines])).reshape(-1, 2)
-    tails = set(label.ravel().tolist())
+    groups = {a: {k for k, line in enumerate(lines) if line.one_way and line.source == a} for a in wanted}
+    ways = _end_nodes(lines).tolist()
 
     def is_strong(one_way: set[int]) -> bool:
-        graph = nx.DiGraph()
-        graph.add_nodes_from(tails)
-        for k, (a, b) in enumerate(label.tolist()):
-            graph.add_edge(a, b)
-            if k not in one_way:
-                graph.add_edge(b, a)
-        return bool(nx.is_strongly_connected(graph))
+        back = [(b, a) for k, (a, b) in enumerate(ways) if k not in one_way]
+        return bool(nx.is_strongly_connected(nx.DiGraph([*ways, *back])))
 
     for aisle in sorted(groups, key=lambda a: (-wanted[a], a)):
-        trial = chosen | set(groups[aisle])
-        if is_strong(trial):
-            chosen = trial
-            continue
-        # The ends of an aisle may be dead ends although its middle is on a loop.
-        inner = [k for k in groups[aisle] if is_strong(chosen | {k})]
-        trial = chosen | set(inner)
-        if inner and is_strong(trial):
+        trial = chosen | groups[aisle]
+        if not (is_whole := is_strong(trial)):
+            # The ends of an aisle may be dead ends although its middle is on a loop.
+            trial = chosen | {k for k in groups[aisle] if is_strong(chosen | {k})}
+        if is_whole or (trial > chosen and is_strong(trial)):
             chosen = trial
         else:
             refused.append(aisle)
     return [Line(line.points, k in chosen, line.source) for k, line in enumerate(lines)], refused
 
 
+def _end_nodes(lines: Sequence[Line]) -> IntArray:
+    """Return the nodes at the first and at the last point of lines, (n, 2)."""
+    return node_labels(np.concatenate([line.points[[0, -1]] for line in lines])).reshape(-1, 2)
+
+
 def largest_part(lines: Sequence[Line]) -> list[list[int]]:
-    graph = nx.Graph()
-    label = node_labels(np.concatenate([line.points[[0, -1]] for line in lines])).reshape(-1, 2)
-    for k, (a, b) in enumerate(label.tolist()):
-        graph.add_edge(("node", a), ("line", k))
-        graph.add_edge(("node", b), ("line", k))
-    parts = [sorted(k for kind, k in part if kind == "line") for part in nx.connected_components(graph)]
+    label = _end_nodes(lines)
+    part = component_labels(label, int(label.max()) + 1)[label[:, 0]]
     length = [shapely.LineString(line.points).length for line in lines]
-    return sorted(parts, key=lambda part: (-sum(length[k] for k in part), part))
+    parts = [np.flatnonzero(part == k).tolist() for k in np.unique(part)]
+    return sorted(parts, key=lambda members: (-sum(length[k] for k in members), members))
 
 
 def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
@@ -195,9 +171,9 @@ def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
 
 def _crowded_nodes(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> list[set[tuple[int, int]]]:
     pairs = [(k, i) for k, line in enumerate(lines) for i in range(len(line))]
-    at: dict[int, set[tuple[int, int]]] = {}
+    at: dict[int, set[tuple[int, int]]] = defaultdict(set)
     for label, pair in zip(node_labels(np.concatenate(lines)).tolist(), pairs, strict=True):
-        at.setdefault(label, set()).add(pair)
+        at[label].add(pair)
     return [
         users
         for users in at.values()
@@ -213,20 +189,15 @@ def _move_lane_end(
     arms = []  # lane, point, neighbouring point
     for k, i in sorted(users):
         arms += [(k, i, j) for j in (i - 1, i + 1) if 0 <= j < len(lines[k]) and (j > i or not oneway[k])]
-    best: tuple[float, int, int] | None = None
-    for a, (k, i, j) in enumerate(arms):
-        for b, (other, i_b, j_b) in enumerate(arms):
-            ends = i in (0, len(lines[k]) - 1)
-            if not ends or other == k or (oneway[other] and not oneway[k]):
-                continue
+    turns: list[tuple[float, int, int]] = []
+    for (a, (k, i, j)), (b, (other, i_b, j_b)) in product(enumerate(arms), repeat=2):
+        if i in (0, len(lines[k]) - 1) and other != k and (oneway[k] or not oneway[other]):
             one, two = lines[k][j] - lines[k][i], lines[other][j_b] - lines[other][i_b]
-            turn = float(one @ two / (np.hypot(*one) * np.hypot(*two)))
-            if best is None or turn > best[0]:
-                best = (turn, a, b)
-    if best is None:
+            turns.append((float(one @ two / (np.hypot(*one) * np.hypot(*two))), -a, -b))
+    if not turns:
         return ()
-    k, i, _ = arms[best[1]]
-    other, i_b, j_b = arms[best[2]]
+    _, a, b = max(turns)
+    (k, i, _), (other, i_b, j_b) = arms[-a], arms[-b]
     arm = lines[other][j_b] - lines[other][i_b]
     length = float(np.hypot(*arm))
     joint = lines[other][i_b] + min(JOIN_DISTANCE, length / 2) / length * arm
@@ -274,7 +245,7 @@ def entries_from_streets(
     is_street = np.array([line.source == STREET for line in lines])
     if not is_street.any():
         return None
-    label = node_labels(np.concatenate([line.points[[0, -1]] for line in lines])).reshape(-1, 2)
+    label = _end_nodes(lines)
     shapes = np.array([shapely.LineString(line.points) for line in lines])
     used = np.unique(np.asarray(shapely.STRtree(shapes).nearest(shapely.points(mouths))))
     inner = [line for line, street in zip(lines, is_street, strict=True) if not street]
@@ -324,23 +295,18 @@ def _best_way_out(
     except shapely.errors.GEOSException:  # it cannot triangulate, as with many corners on one line
         ground = shapely.convex_hull(whole)
     shapely.prepare(ground)
-    ends = np.concatenate([line.points[[0, -1]] for line in lines])
-    label = node_labels(ends)
-    at = {int(k): xy for k, xy in zip(label[::-1], ends[::-1], strict=True)}
+    ends, label = np.concatenate([line.points[[0, -1]] for line in lines]), _end_nodes(lines)
+    at = {int(k): xy for k, xy in zip(label.ravel()[::-1], ends[::-1], strict=True)}
     graph = nx.Graph()
-    for (a, b), line in zip(label.reshape(-1, 2).tolist(), lines, strict=True):
+    for (a, b), line in zip(label.tolist(), lines, strict=True):
         graph.add_edge(a, b, weight=shapely.LineString(line.points).length)
     names = sorted(at)
     nodes = np.array([at[k] for k in names])
-    nearest = shapely.STRtree(np.asarray(shapely.points(nodes))).nearest(
-        np.asarray(shapely.points(spaces_xy))
-    )
-    weight = np.bincount(np.asarray(nearest), minlength=len(names))
+    at_nodes = shapely.STRtree(np.asarray(shapely.points(nodes)))
+    weight = np.bincount(at_nodes.nearest(np.asarray(shapely.points(spaces_xy))), minlength=len(names))
     guesses: list[tuple[float, float, float, FloatArray, bool]] = []
     for name, xy in zip(names, nodes, strict=True):
-        ways = _ways_out(name, xy, lines, label, graph)
-        if not ways:
-            continue
+        ways = _ways_out(name, xy, lines, label.ravel(), graph)
         reach = nx.single_source_dijkstra_path_length(graph, name, weight="weight")
         drive = float(sum(weight[i] * reach.get(other, 1e3) for i, other in enumerate(names)) / weight.sum())
         for way, is_end in ways:
@@ -400,7 +366,6 @@ SHORTEST = 0.3  # m
 @dataclass(frozen=True, eq=False)
 class Connection:
     points: FloatArray  # (k, 2) m
-    ends: tuple[int, int]  # indices of the aisles
     clearance: float  # m, distance to the nearest obstacle
 
 
@@ -460,21 +425,19 @@ def connect(lines: Sequence[FloatArray], space: FreeSpace, longest: float) -> li
         points = points[np.r_[True, np.hypot(*np.diff(points, axis=0).T) > 0.05]]
         graph.add_edge(i, j, weight=c)
         if len(points) > 1:
-            found.append(Connection(points, (int(owner[i]), int(owner[j])), space.room(points)))
+            found.append(Connection(points, space.room(points)))
     return found
 
 
 def _samples(lines: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return points every metre along lines, ends included: stations, (n,) m, points, (n, 2) m, and lines, (n,)."""
-    stations, xy, owner = [], [], []
-    for k, points in enumerate(lines):
-        line = shapely.LineString(points)
-        count = max(2, int(np.ceil(line.length / SAMPLE)) + 1)
-        at = np.linspace(0.0, line.length, count)
-        stations.append(at)
-        xy.append(shapely.get_coordinates(shapely.line_interpolate_point(line, at)))
-        owner.append(np.full(count, k))
-    return np.concatenate(stations), np.concatenate(xy), np.concatenate(owner)
+    shapes = [shapely.LineString(points) for points in lines]
+    counts = [max(2, int(np.ceil(line.length / SAMPLE)) + 1) for line in shapes]
+    at = [np.linspace(0.0, line.length, count) for line, count in zip(shapes, counts, strict=True)]
+    owner = np.repeat(np.arange(len(lines)), counts)
+    stations = np.concatenate(at)
+    on_line = shapely.line_interpolate_point(np.array(shapes)[owner], stations)
+    return stations, shapely.get_coordinates(on_line), owner
 
 
 def _road_graph(
@@ -520,14 +483,10 @@ class FreeSpace:
         self.low = np.array([x0, y0]) - MARGIN
         nx, ny = np.ceil((np.array([x1, y1]) + MARGIN - self.low) / self.cell).astype(int)
         self.shape = (int(nx), int(ny))
-        self.xy = (
-            self.low
-            + (np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), -1) + 0.5) * self.cell
-        )
+        centers = np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij")
+        self.xy = self.low + (np.stack(centers, -1) + 0.5) * self.cell
         shapely.prepare(whole)
-        covered = shapely.contains_xy(whole, self.xy[..., 0].ravel(), self.xy[..., 1].ravel()).reshape(
-            self.shape
-        )
+        covered = shapely.contains_xy(whole, self.xy[..., 0], self.xy[..., 1])
         self.clearance = np.asarray(distance_transform_edt(~covered)) * self.cell - 0.5 * self.cell
         self._whole = whole
         self._boundary = shapely.STRtree(shapely.get_parts(whole))
@@ -578,19 +537,14 @@ class FreeSpace:
     def pulled_straight(self, path: FloatArray) -> FloatArray:
         """Return a path with as few corners as its clearance allows, (k, 2) m."""
         wide = self.clearance.ravel()[self.cells(path)]
-        kept, at = [0], 0
-        while at < len(path) - 1:
-            ahead = len(path) - 1
+        kept, last = [0], len(path) - 1
+        while (at := kept[-1]) < last:
+            ahead = last
             while ahead > at + 1:
-                least = float(
-                    np.clip(
-                        wide[at : ahead + 1].min() - 0.6 * self.cell, LEAST_CLEARANCE - 0.1, COMFORTABLE - 0.3
-                    )
-                )
+                room = wide[at : ahead + 1].min() - 0.6 * self.cell
+                least = float(np.clip(room, LEAST_CLEARANCE - 0.1, COMFORTABLE - 0.3))
                 if self.is_clear(path[[at, ahead]], least):
                     break
                 ahead -= max(1, (ahead - at) // 12)
-            ahead = max(ahead, at + 1)
-            kept.append(ahead)
-            at = ahead
+            kept.append(max(ahead, at + 1))
         return path[kept]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require
 from parkenv.lots.generators import BAY_SIZE, KERB_SIZE
 from parkenv.world.drive_graph import component_labels
 from parkenv.world.lot import corner_points
@@ -73,17 +73,12 @@ def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> S
     validate_areas(ids, area)
     corners = np.stack([rectangle_corners(outline) for outline in outlines])
     sides = np.roll(corners, -1, axis=1) - corners
-    size = np.hypot(sides[..., 0], sides[..., 1])
-    turn = size[:, 0] < size[:, 1]
-    long = np.where(turn[:, None], sides[:, 1], sides[:, 0])
-    length = np.where(turn, size[:, 1], size[:, 0])
-    spaces = Spaces(
-        tuple(ids),
-        corners.mean(axis=1),
-        long / length[:, None],
-        length,
-        np.minimum(np.where(turn, size[:, 0], size[:, 1]), area / length),
-    )
+    size = np.hypot(sides[..., 0], sides[..., 1])[:, :2]
+    row, along = np.arange(len(outlines)), np.argmax(size, axis=1)
+    length, across = size[row, along], size[row, 1 - along]
+    axis = sides[row, along] / length[:, None]
+    width = np.minimum(across, area / length)
+    spaces = Spaces(tuple(ids), corners.mean(axis=1), axis, length, width)
     _refuse_drawn_twice(ids, outlines, area)
     return without_overlaps(spaces)
 
@@ -277,7 +272,8 @@ def _chain(spaces: Spaces, order: IntArray, *, kerbside: bool) -> Row:
             # One angle between row and cars for the whole row, so that a step in it does not turn its front.
             turn = np.angle(np.exp(1j * (_bearing(step) - _bearing(axis))).sum())
             turn = np.round(turn / RIGHT) * RIGHT if abs(abs(turn) - np.pi / 2) < SQUARE else turn
-            along = _turned(axis, float(turn))
+            cos, sin = np.cos(turn), np.sin(turn)
+            along = np.asarray(axis @ np.array([[cos, sin], [-sin, cos]]))
         across = np.stack([-axis[:, 1], axis[:, 0]], axis=1)
         to_mouth = across if kerbside else axis
     # Mouths of one side lie on the same side of the row.
@@ -303,11 +299,6 @@ def _one_way(vectors: FloatArray) -> FloatArray:
 
 def _bearing(vectors: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(vectors[:, 1], vectors[:, 0]))
-
-
-def _turned(vectors: FloatArray, angle: float) -> FloatArray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.asarray(vectors @ np.array([[cos, sin], [-sin, cos]]))
 
 
 SPACING = (1.8, 8.0)  # least and greatest distance, m, from a space to the next in its row
@@ -374,16 +365,15 @@ def spaces_from_centers(
 
 
 def _find_rows(xy: FloatArray) -> tuple[list[CenterRow], IntArray]:
-    if len(xy) < 4:
-        raise InputError(f"{len(xy)} slots, want at least 4 to find rows")
+    require(len(xy) >= 4, f"{len(xy)} slots, want at least 4 to find rows")
     tree = cKDTree(xy)
     distance, nearest = map(np.asarray, tree.query(xy, k=2))
     spacing = distance[:, 1]
     usual = float(np.median(spacing))
-    if not SPACING[0] <= usual <= SPACING[1]:
-        raise InputError(
-            f"neighbours are {usual:.2f} m apart, want {SPACING[0]:g} to {SPACING[1]:g} m: are these metres?"
-        )
+    require(
+        SPACING[0] <= usual <= SPACING[1],
+        f"neighbours are {usual:.2f} m apart, want {SPACING[0]:g} to {SPACING[1]:g} m: are these metres?",
+    )
     way = xy[nearest[:, 1]] - xy
     way /= np.hypot(way[:, 0], way[:, 1])[:, None]
     pairs = tree.query_pairs(SAME_SPACING * SPACING[1], output_type="ndarray").reshape(-1, 2)
@@ -450,14 +440,13 @@ def _angle(row: CenterRow, yaw: FloatArray | None, ids: Sequence[str]) -> float:
     """Return the angle between a row and its cars, rad: 0 along it, to π/2."""
     name = f"the row of slots {ids[row.members[0]]!r:.40} to {ids[row.members[-1]]!r:.40}"
     if yaw is None:
-        if WIDEST_BAY < row.spacing < SHORTEST_KERB:
-            raise InputError(
-                f"{name} has a slot every {row.spacing:.2f} m, too wide for perpendicular and too short for "
-                "parallel parking; give a yaw column"
-            )
+        require(
+            not WIDEST_BAY < row.spacing < SHORTEST_KERB,
+            f"{name} has a slot every {row.spacing:.2f} m, too wide for perpendicular and too short for "
+            "parallel parking; give a yaw column",
+        )
         return np.pi / 2 if row.spacing <= WIDEST_BAY else 0.0
     mean = np.exp(2j * (yaw - np.arctan2(row.along[:, 1], row.along[:, 0]))).mean()
-    if abs(mean) < SAME_ANGLE:
-        raise InputError(f"{name}: cars stand at different angles")
+    require(abs(mean) >= SAME_ANGLE, f"{name}: cars stand at different angles")
     angle = float(abs(np.angle(mean))) / 2
     return 0.0 if angle < ALONG else angle

@@ -1,9 +1,8 @@
 """Answers of Overpass, and XML with positions in place of nodes (`out geom`), as plain elements."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree import ElementTree
 
 from parkenv.errors import InputError, naming
@@ -11,34 +10,6 @@ from parkenv.files.limited_reading import open_limited
 
 _FAILED = re.compile(r"error|timed out|out of memory|limit|abort", re.IGNORECASE)
 MOST_BYTES = 4_000_000_000  # maximum size of unpacked XML
-
-
-class Answer(NamedTuple):
-    """An element of an answer of Overpass, with the members that readers of files of OpenStreetMap have."""
-
-    id: int
-    version: int
-    tags: dict[str, str]
-    nodes: Sequence[Any] = ()
-    members: Sequence[Any] = ()
-    location: Any = None
-
-
-class Member(NamedTuple):
-    ref: Any
-    type: str = "n"
-    role: str = ""
-
-
-class Location(NamedTuple):
-    lat: Any
-    lon: Any
-
-    def lat_without_check(self) -> Any:
-        return self.lat
-
-    def lon_without_check(self) -> Any:
-        return self.lon
 
 
 def elements_of_xml(path: Path) -> list[Any]:

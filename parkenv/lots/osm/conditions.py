@@ -52,18 +52,12 @@ _OTHERS = (
 # Mondays of the week that counts and of those that must be like it, in summer and in winter.
 _WEEKS = tuple(datetime(2026, month, day) for month, day in ((6, 8), (6, 1), (11, 2), (11, 9)))
 _DAY_NAMES = {
-    **{name: DAYS[k] for k, name in enumerate(("mon", "tue", "wed", "thu", "fri", "sat", "sun"))},
-    **{f"{name}day": DAYS[k] for k, name in ((0, "mon"), (4, "fri"), (6, "sun"))},
-    **{"tues": "Tu", "tuesday": "Tu", "wednesday": "We", "thur": "Th", "thurs": "Th", "thursday": "Th"},
-    **{
-        "saturday": "Sa",
-        "di": "Tu",
-        "mi": "We",
-        "do": "Th",
-        "so": "Su",
-        "daily": "Mo-Su",
-        "täglich": "Mo-Su",
-    },
+    **dict(zip(("mon", "tue", "wed", "thu", "fri", "sat", "sun"), DAYS, strict=True)),
+    **dict(
+        zip(("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday"), DAYS, strict=True)
+    ),
+    **{"tues": "Tu", "thur": "Th", "thurs": "Th", "di": "Tu", "mi": "We", "do": "Th", "so": "Su"},
+    **{"daily": "Mo-Su", "täglich": "Mo-Su"},
 }
 _MONTHS = re.compile(r"Jan|Feb|Mar|Apr|May|Jun|Jul|Aug|Sep|Oct|Nov|Dec|week|easter|\d{4}", re.I)
 
@@ -227,9 +221,9 @@ def _clauses(text: str) -> list[str]:
 def _holds(factor: str) -> BoolArray | None:
     """Return whether a condition holds for an ordinary car and driver; None if it may be hours."""
     if match := re.fullmatch(r"(\w+)\s*(<=?|>=?|=)\s*(\d+(?:\.\d+)?)\s*\w*", factor):
-        if match[1].lower() not in ORDINARY_CAR:
+        if (car := ORDINARY_CAR.get(match[1].lower())) is None:
             return None
-        car, limit = ORDINARY_CAR[match[1].lower()], float(match[3])
+        limit = float(match[3])
         holds = {"<": car < limit, ">": car > limit, "=": car == limit}[match[2][0]]
         return always() if holds else ~always()
     word = factor.lower().replace("-", "_")

@@ -30,7 +30,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, require
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.infer.layout import draft_inferred_lot, infer_lot
@@ -83,7 +83,7 @@ from parkenv.lots.osm.roads import (
     used_roads,
     whole_number,
 )
-from parkenv.lots.unread import unread_table
+from parkenv.lots.unread import noting_unread, unread_rows
 from parkenv.world.drive_graph import SLOT_REACH, component_labels
 from parkenv.world.lot import Lane
 
@@ -101,12 +101,14 @@ MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
 
 def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     path = Path(path)
-    with unread_table() as unread:
+    with noting_unread() as unread:
         place = read_map(path)
         with naming(path):
             draft = draft_of_map(place_name(path), place, options or ImportOptions(), place.positions.frame)
     found = (*filter(None, [place.positions.found]), *draft.found, *place.cut_elements())
-    return replace(draft, found=found, left_out=(*place.left_out, *draft.left_out), unread=unread.rows)
+    return replace(
+        draft, found=found, left_out=(*place.left_out, *draft.left_out), unread=unread_rows(unread)
+    )
 
 
 def draft_of_map(
@@ -195,11 +197,11 @@ class _Slot(NamedTuple):
 class _LotImport(MapImport):
     def __init__(self, name: str, place: OsmMap, options: ImportOptions, frame: LocalFrame | None) -> None:
         parking = [e for e in place.elements if _is_parking(e)]
-        if not parking:
-            raise InputError(
-                "no parking in it: no amenity=parking_space, no amenity=parking, no street with "
-                "parking:left, parking:right or parking:both"
-            )
+        require(
+            parking,
+            "no parking in it: no amenity=parking_space, no amenity=parking, no street with "
+            "parking:left, parking:right or parking:both",
+        )
         refuse_far_away([e for e in place.elements if _is_parking(e) or "highway" in e.tags])
         super().__init__(name, place, frame or map_frame(place.elements))
         self.options, self.box = options, options.box(self.frame)
@@ -312,21 +314,16 @@ class _LotImport(MapImport):
 
     def draft(self) -> LotDraft:
         sources, slots = self._without_overlaps()
-        lanes_of_streets = any(slot.rank == Rank.STREET for slot in sources)
-        roads = self.roads
-        if len(slots) and not lanes_of_streets:
-            service = [road for road in roads if road.rank < Rank.STREET]
-            lanes_of_streets = len(components_with_slots(service, slots)) > 1
-        streets = [road for road in roads if road.rank is Rank.STREET]
-        edge = None
-        if lanes_of_streets:
-            edge = self._edge(slots)
-            roads = [part for road in roads for part in clipped_road(road, edge)]
-            lanes_around: list[Road] = []
+        streets = [road for road in self.roads if road.rank is Rank.STREET]
+        service = [road for road in self.roads if road.rank < Rank.STREET]
+        # Streets are lanes, too, where slots open to them or they connect the service roads.
+        on_street = any(slot.rank == Rank.STREET for slot in sources)
+        is_apart = len(slots) > 0 and len(components_with_slots(service, slots)) > 1
+        edge = self._edge(slots) if on_street or is_apart else None
+        if edge is None:
+            roads = used_roads(service, streets, slots)
         else:
-            roads = [road for road in roads if road.rank < Rank.STREET]
-            lanes_around = streets
-        roads = used_roads(roads, lanes_around, slots)
+            roads = used_roads([part for road in self.roads for part in clipped_road(road, edge)], [], slots)
         entries = points_in_frame(self.frame, self.options.entries)
         if not len(entries) and roads:
             entries = (
@@ -389,14 +386,11 @@ class _LotImport(MapImport):
         elif not len(slots):
             yield "no slot: nothing that the file calls parking could be used"
         if len(slots) and roads and not len(entries):
-            at = np.array([xy for _, xy, _ in road_ends(roads)]).reshape(-1, 2)
-            ends = self.frame.to_lonlat(at)[:3, ::-1].tolist()
-            where = (
-                "; lanes end at " + " and ".join(f"{lat:.6f},{lon:.6f}" for lat, lon in ends) if ends else ""
-            )
+            ends = self.frame.to_lonlat([xy for _, xy, _ in road_ends(roads)])[:3, ::-1]
+            where = " and ".join(f"{lat:.6f},{lon:.6f}" for lat, lon in ends.tolist())
             yield (
                 "no entry: the lanes meet no public street in this file, nor do they leave it; give one by "
-                f"--entry LAT,LON{where}"
+                "--entry LAT,LON" + (f"; lanes end at {where}" if where else "")
             )
         if len(slots) and not len(goals):
             yield (
@@ -465,10 +459,10 @@ def outline_draft(
 ) -> LotDraft:
     """Draft a lot from the outlines of its spaces; `parkenv.lots.infer.layout` has the rules."""
     drawn = [e for e in elements if is_space(e)]
-    if len(drawn) > MOST_SPACES:
-        raise InputError(
-            f"{len(drawn):,} parking spaces, want at most {MOST_SPACES:,} in one lot; divide it by --split or --bounds"
-        )
+    require(
+        len(drawn) <= MOST_SPACES,
+        f"{len(drawn):,} parking spaces, want at most {MOST_SPACES:,} in one lot; divide it by --split or --bounds",
+    )
     readable, crossing = list[Area](), list[str]()
     for element in drawn:
         try:
@@ -590,8 +584,7 @@ def split_town(
     name: str, elements: Sequence[OsmElement], least: int
 ) -> Iterator[tuple[str, list[OsmElement]]]:
     spaces = [e for e in elements if is_space(e)]
-    if not spaces:
-        raise InputError("no amenity=parking_space in it, want their outlines to find car parks")
+    require(spaces, "no amenity=parking_space in it, want their outlines to find car parks")
     if len(spaces) > MOST_IN_TOWN:
         raise InputError(f"{len(spaces):,} parking spaces, want at most {MOST_IN_TOWN:,} in one file")
     frame = map_frame(spaces)
@@ -601,10 +594,9 @@ def split_town(
     size = np.bincount(label)
     first = np.array([int(np.flatnonzero(label == k)[0]) for k in range(len(size))])
     chosen = [k for k in np.lexsort((first, -size)).tolist() if size[k] >= least]
-    if not chosen:
-        raise InputError(
-            f"{len(spaces)} parking spaces in groups of at most {size.max()}, want a group of {least}"
-        )
+    require(
+        chosen, f"{len(spaces)} parking spaces in groups of at most {size.max()}, want a group of {least}"
+    )
     others = [e for e in elements if not is_space(e)]
     around = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in others], dtype=object)
     tree = shapely.STRtree(around)

@@ -19,18 +19,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, naming, with_extra
+from parkenv.errors import InputError, naming, require, with_extra
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json, require_file, unpacked_path
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.formats.geojson import Positions
-from parkenv.lots.osm.answers import Answer, Location, Member, elements_of_xml, has_geometry, refuse_partial
+from parkenv.lots.osm.answers import elements_of_xml, has_geometry, refuse_partial
 from parkenv.lots.osm.export_tags import NESTED, OSM_ID, id_of_feature, tags_of_feature
 
 # Keys that distinguish elements of OpenStreetMap from other GeoJSON.
@@ -117,10 +118,7 @@ class OsmMap:
                 kept.append(element)
             else:
                 beyond.append(element.id)
-        if not kept:
-            raise InputError(
-                f"nothing of the map is within latitudes and longitudes {bounds[0]} to {bounds[1]}"
-            )
+        require(kept, f"nothing of the map is within latitudes and longitudes {bounds[0]} to {bounds[1]}")
         outside = LeftOut.by_reason({"clipped: outside the bounds": beyond})
         return replace(self, elements=kept, left_out=(*self.left_out, *outside))
 
@@ -237,7 +235,8 @@ class _RawElements:
         is_wanted = any(key in node.tags for key in NODE_KEYS)
         if is_wanted or node.id in self.needed_nodes:
             name, at, version = f"node/{node.id}", node.location, node.version or 0
-            position = _position(name, at.lat_without_check(), at.lon_without_check())
+            position = at if isinstance(at, tuple) else (at.lat_without_check(), at.lon_without_check())
+            position = _position(name, *position)
             before = self.versions.get(node.id, -1)
             if before == version and self.positions[node.id] != position:
                 raise InputError(f"{name} appears twice, at different positions")
@@ -270,11 +269,11 @@ class _RawElements:
         ]
         tagged = {i: way for i, way in self.ways.items() if way.tags}
         ways = [way for i, raw in tagged.items() if (way := self._way(i, raw)) is not None]
-        if self.left_out and not ways:
-            raise InputError(
-                "none of its ways has its nodes in the file; export with complete ways (Overpass: "
-                "`out body; >; out skel qt;`)"
-            )
+        require(
+            ways or not self.left_out,
+            "none of its ways has its nodes in the file; export with complete ways (Overpass: "
+            "`out body; >; out skel qt;`)",
+        )
         areas, turns = list[OsmElement](), list[OsmTurn]()
         no_turns: dict[str, list[str]] = defaultdict(list)
         for i, raw in self.relations.items():
@@ -414,8 +413,8 @@ def _read_osm(path: Path) -> OsmMap:
     with naming(path), with_extra("OpenStreetMap", "osm"):
         import osmium
     require_file(path)
-    if not path.stat().st_size:  # so is what waits to be read, such as a link to /proc/kmsg
-        raise InputError(f"{path}: is empty")
+    # so is what waits to be read, such as a link to /proc/kmsg
+    require(path.stat().st_size, f"{path}: is empty")
     packed = path.suffix.lower() if path != unpacked_path(path) else ""
     source = osmium.io.File(str(path), "pbf" if path.suffix.lower() == ".pbf" else f"osm{packed}")
     raw, count = _RawElements(), 0
@@ -484,16 +483,12 @@ def _preference(feature: Any, element: OsmElement) -> _Preference:
 
 def _each_once(pairs: Sequence[tuple[OsmElement, _Preference]]) -> list[OsmElement]:
     """Return elements, those given several times once: with one id, or closed, with one outline and kind."""
-    for key_of in (_id_of, _outline_of):
+    for key_of in (lambda element: element.id, _outline_of):
         groups: dict[object, list[tuple[OsmElement, _Preference]]] = defaultdict(list)
         for pair in pairs:
             groups[key_of(pair[0])].append(pair)
         pairs = [(_union(group), min(p for _, p in group)) for group in groups.values()]
     return [element for element, _ in pairs]
-
-
-def _id_of(element: OsmElement) -> object:
-    return element.id
 
 
 def _outline_of(element: OsmElement) -> object:
@@ -573,13 +568,13 @@ def _is_on(tags: Mapping[str, str], key: str) -> int:
 def _map_of_overpass(elements: list[Any]) -> OsmMap:
     raw = _RawElements()
 
-    def refs_of(name: str, given: dict[str, Any]) -> list[Member]:
+    def refs_of(name: str, given: dict[str, Any]) -> list[Any]:
         refs, geometry = given.get("nodes"), given.get("geometry") or []
         points = [_position(name, p.get("lat"), p.get("lon")) if p else BEYOND for p in geometry]
         if not isinstance(refs, list) or (points and len(refs) != len(points)):
             refs = points
         raw.positions.update({ref: p for ref, p in zip(refs, points, strict=False) if p is not BEYOND})
-        return [Member(ref) for ref in refs]
+        return [SimpleNamespace(ref=ref) for ref in refs]
 
     for kind, add in (("relation", raw.add_relation), ("way", raw.add_way), ("node", raw.add_node)):
         for index, given in enumerate(elements):
@@ -587,23 +582,25 @@ def _map_of_overpass(elements: list[Any]) -> OsmMap:
                 raise InputError(f"elements[{index}] is {given!r:.40}, want an object with type and id")
             if given.get("type") != kind:
                 continue
-            name, tags = f"{kind}/{given['id']}", tags_of_feature({"tags": given.get("tags") or {}})
+            name, listed = f"{kind}/{given['id']}", given.get("members", ())
+            element = SimpleNamespace(id=given["id"], version=given.get("version") or 0)
+            element.tags = tags_of_feature({"tags": given.get("tags") or {}})
+            element.location = (given.get("lat"), given.get("lon"))
             try:
-                members = [
-                    Member(m["ref"], m["type"][:1], m.get("role", "")) for m in given.get("members", ())
+                element.members = [
+                    SimpleNamespace(ref=m["ref"], type=m["type"][:1], role=m.get("role", "")) for m in listed
                 ]
-                nodes = refs_of(name, given)
-                more = [(m, refs_of(name, m)) for m in given.get("members", ()) if m.get("geometry")]
+                element.nodes = refs_of(name, given)
+                more = [(m["ref"], refs_of(name, m)) for m in listed if m.get("geometry")]
             except (AttributeError, KeyError, TypeError) as error:
                 raise InputError(
                     f"{name}: want members, nodes and geometry as Overpass writes them"
                 ) from error
-            at = Location(given.get("lat"), given.get("lon"))
-            add(Answer(given["id"], given.get("version") or 0, tags, nodes, members, at))
-            for member, line in more:
-                if member["ref"] in raw.needed_ways:
-                    raw.add_way(Answer(member["ref"], -1, {}, line))
-            for m in given.get("members", ()):
+            add(element)
+            for ref, line in more:
+                if ref in raw.needed_ways:
+                    raw.add_way(SimpleNamespace(id=ref, version=-1, tags={}, nodes=line))
+            for m in listed:
                 if m["type"] == "node" and "lat" in m and m["ref"] in raw.needed_nodes:
                     raw.positions.setdefault(m["ref"], _position(name, m["lat"], m["lon"]))
     return raw.map()

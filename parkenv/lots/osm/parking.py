@@ -5,9 +5,10 @@ Both tagging schemes of kerbs are read: `parking:left|right|both` with `:orienta
 everybody may park at some hours. A capacity of `both` applies to each side.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import shapely
@@ -74,8 +75,7 @@ ARRANGEMENTS = {
 DRAWN = 0.05  # tolerance, m, of the length of a row: OpenStreetMap's seven digits round to a centimetre
 
 
-@dataclass(frozen=True, eq=False)
-class RowAnchors:
+class RowAnchors(NamedTuple):
     """Anchors of a row's slots: n points on the road's centre line."""
 
     xy: FloatArray  # (n, 2) m
@@ -124,8 +124,8 @@ def bend_factor(points: FloatArray, start: float, end: float, side: Side, reach:
     n = max(int((end - start) / 2.0), 2)
     step = (end - start) / n
     stations = np.asarray(start + (np.arange(n) + 0.5) * step, dtype=np.float64)
-    anchors = row_anchors(points, stations, step, side)
-    beside = np.diff(anchors.xy + reach * anchors.outward, axis=0)
+    xy, _, outward = row_anchors(points, stations, step, side)
+    beside = np.diff(xy + reach * outward, axis=0)
     return max(1.0, (end - start) * (n - 1) / n / max(float(np.hypot(beside[:, 0], beside[:, 1]).sum()), 0.1))
 
 
@@ -317,13 +317,13 @@ class Junctions:
         self._label = label
         self._crossings = set(label[self._first[-1] :].tolist())
         # For every node, its arms: road, unit vector.
-        self._arms: dict[int, list[tuple[int, FloatArray]]] = {}
+        self._arms: dict[int, list[tuple[int, FloatArray]]] = defaultdict(list)
         for k, road in enumerate(roads):
             for i, at in enumerate(label[self._first[k] : self._first[k + 1]].tolist()):
                 for j in (i - 1, i + 1):
                     if 0 <= j < len(road.points):
                         away = road.points[j] - road.points[i]
-                        self._arms.setdefault(at, []).append((k, away / np.hypot(*away)))
+                        self._arms[at].append((k, away / np.hypot(*away)))
 
     def closed_intervals(self, k: int, side: Side) -> list[tuple[float, float]]:
         """Return the intervals without parking on a side of road k, start and end in m from its start.
@@ -335,12 +335,10 @@ class Junctions:
         closed = []
         for i, station in enumerate(stations):
             at = int(self._label[self._first[k] + i])
-            if at in self._crossings:
-                closed.append((station - CORNER_CLEARANCE, station + CORNER_CLEARANCE))
-            if len(self._arms[at]) < 3:
-                continue
-            tangent = points[min(i + 1, len(points) - 1)] - points[max(i - 1, 0)]
-            clearances = self._clearances(k, at, tangent / np.hypot(*tangent), side)
+            clearances = [CORNER_CLEARANCE] if at in self._crossings else []
+            if len(self._arms[at]) > 2:
+                tangent = points[min(i + 1, len(points) - 1)] - points[max(i - 1, 0)]
+                clearances += self._clearances(k, at, tangent / np.hypot(*tangent), side)
             closed += [(station - clearance, station + clearance) for clearance in clearances]
         return closed
 
@@ -588,21 +586,20 @@ def usable_spaces(
 
 def _why_no_slot(space: Area, private: Sequence[shapely.Geometry]) -> str | None:
     tags, kind = space.element.tags, space.element.tags.get("parking_space", "normal")
-    if space.element.cut:
-        return "spaces cut at the edge of the map"
     disabled = tags.get("capacity:disabled", "no") not in ("no", "0")
-    if disabled or "disabled" in (kind, tags.get("access")):
-        return "spaces for disabled drivers"
-    if kind not in CAR_SPACES:
-        return f"spaces with parking_space={kind}"
-    if reason := closed_to_cars(tags) or off_the_ground(tags):
-        return f"spaces with {reason}"
+    closed = closed_to_cars(tags) or off_the_ground(tags)
     inside = shapely.point_on_surface(space.polygon)
-    if any(shapely.contains(other, inside) for other in private):
-        return "spaces in private parking"
-    if not whole_number(tags.get("capacity")) and float(shapely.area(space.polygon)) > LARGEST_SPACE:
-        return f"spaces larger than {LARGEST_SPACE:g} m² without a capacity"
-    return None
+    is_large = float(shapely.area(space.polygon)) > LARGEST_SPACE
+    reasons = {
+        "spaces cut at the edge of the map": space.element.cut,
+        "spaces for disabled drivers": disabled or "disabled" in (kind, tags.get("access")),
+        f"spaces with parking_space={kind}": kind not in CAR_SPACES,
+        f"spaces with {closed}": closed is not None,
+        "spaces in private parking": any(shapely.contains(other, inside) for other in private),
+        f"spaces larger than {LARGEST_SPACE:g} m² without a capacity": is_large
+        and not whole_number(tags.get("capacity")),
+    }
+    return next((reason for reason, holds in reasons.items() if holds), None)
 
 
 def slots_by_rank(

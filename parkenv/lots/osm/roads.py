@@ -228,7 +228,8 @@ def _parts_between(
     near: Any = at.query_ball_point(road.points, NODE_TOLERANCE)
     for i, each in enumerate(near):
         for tags, name in ((barriers[k].tags, barriers[k].id) for k in each):
-            if road.rank is not Rank.STREET and _assumed_open(tags):
+            is_usual = tags.get("barrier") in ASSUMED_OPEN and tags.get("locked") != "yes"
+            if road.rank is not Rank.STREET and is_usual and not closed_to_cars(tags):
                 note_unread(tags, "barrier", "open to cars on a service road")
                 continue
             stops[i] = True
@@ -244,10 +245,6 @@ def _parts_between(
             points[end] += is_cut * min(BARRIER_GAP / np.hypot(*step), 0.4) * step
         parts.append(replace(road, points=points))
     return parts
-
-
-def _assumed_open(tags: Mapping[str, str]) -> bool:
-    return tags.get("barrier") in ASSUMED_OPEN and not closed_to_cars(tags) and tags.get("locked") != "yes"
 
 
 ACCESS = ("motorcar", "motor_vehicle", "vehicle", "access")  # keys of access, the most specific first
@@ -341,19 +338,14 @@ def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
 def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> list[Road]:
     """Return the roads connected to slots, without service roads that lead neither to a slot nor to one `around`."""
     kept = [road for part in components_with_slots(roads, slots) for road in part]
-    serving = _serving_roads(kept, slots)
-    while True:
-        along = [set(labels.tolist()) for labels in _road_nodes([*kept, *around])]
-        users = Counter(label for labels in along for label in labels)
-        loose = [
-            road.rank < Rank.STREET and k not in serving and sum(users[n] > 1 for n in along[k]) < 2
-            for k, road in enumerate(kept)
-        ]
-        if not any(loose):
-            return kept
-        new_number = np.cumsum(~np.array(loose)) - 1
-        serving = {int(new_number[k]) for k in serving}
-        kept = [road for road, dead in zip(kept, loose, strict=True) if not dead]
+    nodes = [set(labels.tolist()) for labels in _road_nodes([*kept, *around])]
+    users = Counter(node for own in nodes for node in own)
+    needed = _serving_roads(kept, slots) | {k for k, road in enumerate(kept) if road.rank is Rank.STREET}
+    left = list(range(len(kept)))
+    while loose := {k for k in left if k not in needed and sum(users[n] > 1 for n in nodes[k]) < 2}:
+        users.subtract(node for k in loose for node in nodes[k])
+        left = [k for k in left if k not in loose]
+    return [kept[k] for k in left]
 
 
 def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) -> FloatArray:

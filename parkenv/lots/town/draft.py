@@ -25,7 +25,7 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, naming, with_extra
+from parkenv.errors import InputError, naming, require, with_extra
 from parkenv.files.file_names import is_plain
 from parkenv.lots.bays.kerbs import kerb_slots_of
 from parkenv.lots.bays.register import Box, Register, Rule, read_bays
@@ -34,7 +34,14 @@ from parkenv.lots.draft import UNREACHED, LeftOut, LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots, nearest_on_lanes
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.conditions import RESERVED_PLACES, closed_parking, note_other_keys
-from parkenv.lots.osm.draft import MAPPED_OVERLAP, NO_AISLE, RULE_OVERLAP, MapImport, refuse_far_away
+from parkenv.lots.osm.draft import (
+    MAPPED_OVERLAP,
+    NO_AISLE,
+    RULE_OVERLAP,
+    SAME_CAR_PARK,
+    MapImport,
+    refuse_far_away,
+)
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.parking import (
     CAR_SPACES,
@@ -67,7 +74,7 @@ from parkenv.lots.town.supply import (
     strip_side,
     table_of,
 )
-from parkenv.lots.unread import Unread, note_unread, unread_table
+from parkenv.lots.unread import Unread, note_unread, noting_unread, unread_rows
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_REACH
 from parkenv.world.lot import Lane
@@ -77,7 +84,6 @@ ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_ent
 AROUND_BAYS = 0.003  # degrees of latitude, some 300 m, around the bays of a register: what is read of a map
 OFF_STREET = ("driveway", "parking_aisle")  # values of `service` of roads without bays at the kerb
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
-SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
 # Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it.
 PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
@@ -133,7 +139,7 @@ def import_town(
     path = Path(path)
     listed = [] if car_parks is None else read_listed(Path(car_parks))
     register = None if bays is None else read_bays(bays, columns)
-    with unread_table() as unread, naming(path):
+    with noting_unread() as unread, naming(path):
         place, name = read_map(path), place_name(path)
         if register is not None:
             town = _around_bays(name, place, register, bounds, left_hand, whole=not bays_only)
@@ -154,7 +160,7 @@ def import_town(
             town.beside = np.array([row.xy for row in town.rows]).reshape(-1, 2)
         draft = town.draft()
     notes = (Unread(part, text, n, assumed) for (part, text, assumed), n in town.unread.items())
-    return replace(draft, draft=replace(draft.draft, unread=(*unread.rows, *notes)))
+    return replace(draft, draft=replace(draft.draft, unread=(*unread_rows(unread), *notes)))
 
 
 class _TownImport(MapImport):
@@ -163,8 +169,7 @@ class _TownImport(MapImport):
         elements = [e.closed() if is_parking_area(e) and not e.is_node else e for e in place.elements]
         elements, merged = _with_nodes_in_areas(elements)
         streets = [e for e in elements if "highway" in e.tags and not e.is_node]
-        if not streets:
-            raise InputError("no street in it, want ways with the tag highway")
+        require(streets, "no street in it, want ways with the tag highway")
         refuse_far_away(streets)
         frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
         super().__init__(name, replace(place, elements=elements), frame)
@@ -308,11 +313,11 @@ class _TownImport(MapImport):
         rules: dict[tuple[Rule, ...], Rules] = {}
         for own, count in Counter(register.rules[kerbs.bay].tolist()).items():
             tags, notes = tags_of(own)
-            with unread_table() as unread:
+            with noting_unread() as unread:
                 rules[own] = rules_of(tags)
             for part, text, assumed in notes:
                 self.unread[part, text, assumed] += count
-            for note in unread.rows:
+            for note in unread_rows(unread):
                 self.unread[note.tag.removesuffix(":conditional"), rules_text(own), note.assumed] += count
         rows: dict[tuple[str, str], list[int]] = defaultdict(list)
         for i, (k, is_left) in enumerate(zip(kerbs.road.tolist(), kerbs.is_left.tolist(), strict=True)):
@@ -415,8 +420,7 @@ class _TownImport(MapImport):
         return float(at[0]), float(at[1])
 
     def draft(self) -> TownDraft:
-        if not self.rows:
-            raise InputError("no parking in it: no kerb, no car park and no garage beside its streets")
+        require(self.rows, "no parking in it: no kerb, no car park and no garage beside its streets")
         parts = [row.slots for row in self.rows]
         slots = Slots.joined(parts)
         mouths = np.concatenate([slots.mouths(), *([row.xy] for row in self.rows if row.xy is not None)])
@@ -428,14 +432,14 @@ class _TownImport(MapImport):
         # Of some car parks alone, the shortest ways are left, and none around what is forbidden.
         turns = turns_of(self.place, self.frame, whole, lanes) if self.beside is None else Turns((), (), ())
         of = np.repeat(np.arange(len(self.rows)), [len(part) for part in parts])
-        named = {pair: "" for row in self.rows for pair in ((row.kind, rules) for rules in row.slot_rules)}
-        named = {(kind, rules): rules.zone(kind).name for kind, rules in named}
-        zone = [named[row.kind, rules] for row in self.rows for rules in row.slot_rules]
-        slots = replace(
-            slots,
-            zone=np.array(zone, np.str_),
-            facility=np.array([self.rows[k].name for k in of.tolist()], np.str_),
+        used = dict.fromkeys(
+            (row.kind, rules)
+            for row in self.rows
+            for rules in (*row.slot_rules, *(r for _, _, r in row.counted), row.rules)
         )
+        zones = {(kind, rules): rules.zone(kind) for kind, rules in used}
+        zone = np.array([zones[row.kind, own].name for row in self.rows for own in row.slot_rules], np.str_)
+        slots = replace(slots, zone=zone, facility=np.array([row.name for row in self.rows], np.str_)[of])
         numbered = [[f"{row.element}-{i + 1}" for i in range(len(row.slots))] for row in self.rows]
         ids = [name for row, names in zip(self.rows, numbered, strict=True) for name in row.slot_ids or names]
         to_lane = nearest_on_lanes(lanes, slots.mouths())[0] - slots.mouths()
@@ -445,17 +449,13 @@ class _TownImport(MapImport):
         slots, ids = slots[index], [ids[i] for i in index.tolist()]
         filled = set(slots.facility.tolist())
         facilities = [f for row in self.rows for f in facilities_of(row, filled)]
-        used = [
-            (row.kind, rules)
-            for row in self.rows
-            for rules in (*row.slot_rules, *(r for _, _, r in row.counted), row.rules)
-        ]
         goals, weights = weighted_goals(
             self.place.elements, self.buildings, self.frame, self.tree, self.beside
         )
         along = self.beside is None and not len(goals)
         if along:
-            goals, weights = goals_along(self.lines)
+            everywhere = shapely.get_coordinates(shapely.segmentize(self.lines, APART))
+            goals, weights = _clustered(everywhere, np.ones((len(everywhere), len(PURPOSES))))
         draft = LotDraft(
             name=self.name,
             slot_ids=tuple(ids),
@@ -470,9 +470,7 @@ class _TownImport(MapImport):
             ),
             frame=self.frame,
             facilities=tuple(facilities),
-            zone_rules={
-                zone.name: zone for zone in (rules.zone(kind) for kind, rules in dict.fromkeys(used))
-            },
+            zone_rules={zone.name: zone for zone in zones.values()},
             goal_weights=weights,
             entry_weights=dict.fromkeys(PURPOSES, traffic),
             turns=turns.kept,
@@ -679,12 +677,6 @@ def weighted_goals(
     if not len(xy):
         return np.empty((0, 2)), {}
     return _clustered(xy, weight)
-
-
-def goals_along(streets: Any) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return goals of all purposes along streets, (n,) LineStrings, where nothing else is mapped."""
-    xy = shapely.get_coordinates(shapely.segmentize(streets, APART))
-    return _clustered(xy, np.ones((len(xy), len(PURPOSES))))
 
 
 def _clustered(xy: FloatArray, weight: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:

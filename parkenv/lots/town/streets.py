@@ -7,7 +7,6 @@ crosses the edge within 600 m is assumed. Service roads that lead to no parking 
 limit over 30 km/h: where 30 is allowed, cars drive at the scenario's speed.
 """
 
-from collections import deque
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
@@ -17,7 +16,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import require
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.local_frame import LocalFrame
@@ -49,8 +48,7 @@ class Streets:
     """The roads of a town, whole ways that cars may drive, in pieces between junctions; `cut` are those at the edge."""
 
     def __init__(self, roads: tuple[Road, ...], cut: frozenset[str], blind: FloatArray) -> None:
-        if not roads:
-            raise InputError("no street that cars may drive in it")
+        require(roads, "no street that cars may drive in it")
         self.roads, self.cut = roads, cut
         self.blind = shapely.multipoints(blind)  # m, barriers, where no street leads on
         count = np.array([len(road.points) for road in roads])
@@ -79,18 +77,18 @@ class Streets:
         part = np.asarray(connected_components(self._graph(), connection="strong")[1], np.int64)
         inside = part[self.nodes[:, 0]] == part[self.nodes[:, 1]]
         metres = np.bincount(part[self.nodes[inside, 0]], self.length[inside], minlength=part.max() + 1)
-        if not metres.any():
-            raise InputError("no street in it leads back to where it began: all are one-way")
+        require(metres.any(), "no street in it leads back to where it began: all are one-way")
         self.kept: BoolArray = inside & (
             part[self.nodes[:, 0]] == int(metres.argmax())
         )  # (n,) whether in the connected part
 
-    def _graph(self, links: Iterable[tuple[int, int]] = ()) -> csr_array[np.float64]:
-        """Return which junction leads to which, also by further links, (n_nodes, n_nodes)."""
-        a, b = self.nodes.T
-        back, more = ~self.oneway, np.array(list(links), np.int64).reshape(-1, 2)
+    def _graph(
+        self, pieces: slice | BoolArray = slice(None), links: Iterable[tuple[int, int]] = ()
+    ) -> csr_array[np.float64]:
+        """Return which junction leads to which by pieces, and by further links, (n_nodes, n_nodes)."""
+        (a, b), back = self.nodes[pieces].T, ~self.oneway[pieces]
+        more, n = np.array(list(links), np.int64).reshape(-1, 2), len(self.node_xy)
         source, target = np.r_[a, b[back], more[:, 0]], np.r_[b, a[back], more[:, 1]]
-        n = len(self.node_xy)
         return csr_array((np.ones(len(source)), (source, target)), shape=(n, n))
 
     def points(self, piece: int) -> FloatArray:
@@ -110,31 +108,32 @@ class Streets:
         That is where the edge cuts them, or where they end and are of a class that leads on, or near the hull of all.
         """
         real = np.flatnonzero(~self.is_beyond)
-        n = len(self.node_xy)
+        n, road = len(self.node_xy), self.road[real]
         users = np.bincount(self.nodes[real].ravel(), minlength=n)
-        two_way = self.nodes[real[~self.oneway[real]]].ravel()
-        # Ways that lead to each junction, and away from it.
-        ways = [np.bincount(np.r_[self.nodes[real, end], two_way], minlength=n) for end in (1, 0)]
+        oneway = self.oneway[real]
+        two_way = self.nodes[real[~oneway]].ravel()
         hull = shapely.concave_hull(shapely.multipoints(self.node_xy), ratio=0.4)
         away = np.asarray(shapely.distance(shapely.points(self.node_xy), shapely.boundary(hull)))
         blind = np.asarray(shapely.dwithin(shapely.points(self.node_xy), self.blind, BARRIER_GAP + 0.1))
-        traffic, enters, leaves = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
-        for piece in real.tolist():
-            road = self.roads[self.road[piece]]
-            kind = road.tags["highway"].removesuffix("_link")
-            weight = ENTRY_WEIGHT.get(kind, 0.25) if road.rank is Rank.STREET else 0.0
-            is_end = self.span[piece, 0] == 0, self.span[piece, 1] == len(road.points) - 1
-            for end, node in enumerate(self.nodes[piece].tolist()):
-                near, cut = away[node] <= AT_EDGE * (4 if road.oneway else 1), road.id in self.cut
-                # Where the edge cuts a way at a junction, other streets end there, too.
-                leads_on = users[node] == 1 and (near or kind in THROUGH or cut)
-                leads_on |= road.oneway and near and not ways[end][node]
-                if blind[node]:
-                    continue
-                if leads_on or (is_end[end] and cut and away[node] <= AT_EDGE):
-                    traffic[node] = max(traffic[node], weight)
-                    enters[node] |= end == 0 or not road.oneway
-                    leaves[node] |= end == 1 or not road.oneway
+        kinds = [r.tags["highway"].removesuffix("_link") for r in self.roads]
+        street = np.array([r.rank is Rank.STREET for r in self.roads])
+        weight = np.where(street, [ENTRY_WEIGHT.get(kind, 0.25) for kind in kinds], 0.0)[road]
+        cut = np.array([r.id in self.cut for r in self.roads])[road]
+        goes_on = np.isin(kinds, THROUGH)[road] | cut
+        last = np.array([len(r.points) - 1 for r in self.roads])[road]
+        traffic, (enters, leaves) = np.zeros(n), np.zeros((2, n), bool)
+        for end, of_road in ((0, 0), (1, last)):
+            node = self.nodes[real, end]
+            # Ways that lead to the start of a piece, or away from its end.
+            ways = np.bincount(np.r_[self.nodes[real, 1 - end], two_way], minlength=n)[node]
+            near = away[node] <= AT_EDGE * np.where(oneway, 4, 1)
+            leads_on = (users[node] == 1) & (near | goes_on) | (oneway & near & (ways == 0))
+            # Where the edge cuts a way at a junction, other streets end there, too.
+            leads_on |= (self.span[real, end] == of_road) & cut & (away[node] <= AT_EDGE)
+            leads_on &= ~blind[node]
+            np.maximum.at(traffic, node[leads_on], weight[leads_on])
+            enters[node[leads_on & (~oneway | (end == 0))]] = True
+            leaves[node[leads_on & (~oneway | (end == 1))]] = True
         return traffic, enters, leaves
 
     def ways_beyond(self) -> list[Road]:
@@ -142,7 +141,7 @@ class Streets:
         start = int(self.nodes[self.kept][0, 0])
         links: dict[tuple[int, int], None] = {}
         while True:
-            graph = self._graph(links)
+            graph = self._graph(links=links)
             reached, returns = np.zeros((2, len(self.node_xy)), bool)
             reached[breadth_first_order(graph, start, return_predecessors=False)] = True
             returns[breadth_first_order(graph.T.tocsr(), start, return_predecessors=False)] = True
@@ -170,25 +169,15 @@ class Streets:
         traffic, enters, _ = self._edge()
         inside = np.zeros(len(self.node_xy), bool)
         inside[self.nodes[self.kept].ravel()] = True
-        onward: dict[int, list[int]] = {}
-        for piece in np.flatnonzero(~self.kept).tolist():
-            a, b = self.nodes[piece].tolist()
-            onward.setdefault(a, []).append(b)
-            if not self.roads[self.road[piece]].oneway:
-                onward.setdefault(b, []).append(a)
-        brought: dict[int, float] = {}
+        graph = self._graph(~self.kept)
+        graph.data[np.repeat(inside, np.diff(graph.indptr))] = 0.0  # what is reached is not left again
+        graph.eliminate_zeros()
+        brought = np.zeros(len(inside))
         for edge in np.flatnonzero(enters & (traffic > 0.0)).tolist():
-            queue, seen = deque([edge]), {edge}
-            while queue:
-                node = queue.popleft()
-                if inside[node]:
-                    brought[node] = max(brought.get(node, 0.0), float(traffic[edge]))
-                    continue
-                fresh = [other for other in onward.get(node, ()) if other not in seen]
-                seen.update(fresh)
-                queue.extend(fresh)
-        nodes = sorted(brought)
-        return self.node_xy[nodes], np.array([brought[node] for node in nodes])
+            reached = breadth_first_order(graph, edge, return_predecessors=False)
+            brought[reached] = np.maximum(brought[reached], traffic[edge])
+        nodes = np.flatnonzero(inside & (brought > 0.0))
+        return self.node_xy[nodes], brought[nodes]
 
     def outermost(self) -> tuple[FloatArray, FloatArray]:
         """Return entries as `entries` does, where the connected part reaches farthest: no street leaves the map."""
@@ -230,20 +219,15 @@ class Streets:
         order = np.lexsort((seconds, b, a))
         _, first = np.unique(np.stack([a, b])[:, order], axis=1, return_index=True)
         quickest = order[first]
-        of = {(int(a[k]), int(b[k])): int(piece[k]) for k in quickest}
-        n = len(self.node_xy)
-        graph = csr_array((seconds[quickest], (a[quickest], b[quickest])), shape=(n, n))
-        before = dijkstra(graph, indices=stops, return_predecessors=True)[1]
+        at, n = (a[quickest], b[quickest]), len(self.node_xy)
+        graph, of = (csr_array((values[quickest], at), shape=(n, n)) for values in (seconds, piece))
         wanted = np.zeros(len(kept), bool)
         wanted[nearest] = True
-        for tree in before.tolist():
-            seen = set[int]()
-            for stop in stops.tolist():
-                node = stop
-                while tree[node] >= 0 and node not in seen:
-                    seen.add(node)
-                    wanted[of[tree[node], node]] = True
-                    node = tree[node]
+        for before in dijkstra(graph, indices=stops, return_predecessors=True)[1]:
+            node = stops
+            while (node := np.unique(node[before[node] >= 0])).size:
+                wanted[of[before[node], node]] = True
+                node = before[node]
         return wanted
 
     def roads_of(self, kept: BoolArray, cuts: Collection[int] = ()) -> list[Road]:
@@ -261,31 +245,19 @@ class Streets:
 
     def _useful(self, mouths: FloatArray) -> BoolArray:
         """Return the pieces kept, without dead ends of service roads that are nearest to no mouth, (n,) bool."""
-        kept = self.kept.copy()
-        index = np.flatnonzero(kept)
-        lines = linestrings([self.points(piece) for piece in index.tolist()])
-        needed = np.zeros(len(kept), bool)
+        lines = linestrings([self.points(piece) for piece in np.flatnonzero(self.kept).tolist()])
+        loose = self.kept & (np.array([road.rank for road in self.roads])[self.road] < Rank.STREET)
         if len(mouths):
             _, nearest = shapely.STRtree(lines).query_nearest(shapely.points(mouths))
-            needed[index[nearest]] = True
-        is_street = np.array([road.rank is Rank.STREET for road in self.roads])[self.road]
-        at: dict[int, set[int]] = {}
-        for piece in index.tolist():
-            for node in self.nodes[piece].tolist():
-                at.setdefault(node, set()).add(piece)
-        loose = deque(at)
-        while loose:
-            node = loose.popleft()
-            if len(at[node]) != 1:
-                continue
-            (piece,) = at[node]
-            if is_street[piece] or needed[piece]:
-                continue
-            kept[piece] = False
-            for end in self.nodes[piece].tolist():
-                at[end].discard(piece)
-                loose.append(end)
-        return kept
+            loose[np.flatnonzero(self.kept)[nearest]] = False
+        kept, (a, b) = self.kept.copy(), self.nodes.T
+        while True:
+            ends = np.r_[a[kept], b[kept & (a != b)]]
+            users = np.bincount(ends, minlength=len(self.node_xy))
+            dead = kept & loose & (users[self.nodes] == 1).any(axis=1)
+            if not dead.any():
+                return kept
+            kept &= ~dead
 
 
 def _speed(road: Road) -> float:

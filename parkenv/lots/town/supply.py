@@ -23,7 +23,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from scipy.optimize import linear_sum_assignment
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, require
 from parkenv.files.field_types import Name
 from parkenv.files.limited_reading import csv_records
 from parkenv.files.spec_file import Spec
@@ -386,8 +386,7 @@ def read_listed(path: Path) -> list[ListedCarPark]:
             if car_park.name in listed:
                 raise InputError(f"name is {car_park.name!r:.40}, want one that no other line has")
             listed[car_park.name] = car_park
-    if not listed:
-        raise InputError(f"{path}: has no car park, want a line for each")
+    require(listed, f"{path}: has no car park, want a line for each")
     return list(listed.values())
 
 
