@@ -243,7 +243,7 @@ class SlotBelief:
         if len(cues):
             of_cues = cues.reshape(3, -1)
             of_cues[2, observed] = np.where(reports, cue_evidence, 0.0)
-            of_cues[0, observed] = self._excess_after(of_cues, observed, reports, later.p_occupied)
+            of_cues[0, observed] = self._excess_after(of_cues, observed, reports, p_occupied)
         later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time
         return later
 

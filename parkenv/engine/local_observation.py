@@ -311,7 +311,7 @@ def _p_occupied(search: Any, column: int) -> float:
         return 0.0 if slot_at(search.slots, column).slot == search.reserved else 1.0
     p = np.float32(block_at(search.blocks, column >> BLOCK_BITS).p_occupied[column & (BLOCK_SIZE - 1)])
     if search.cue_table != 0:
-        return max(float(p) - _announced(search, column), 0.0)
+        return float(max(p - _announced(search, column), 0.0))
     return float(p)
 
 

@@ -87,11 +87,12 @@ class Observation(NamedTuple):
     def of(cls, observation: Mapping[str, Any] | Observation) -> Observation:
         if isinstance(observation, Observation):
             return observation
-        slots, _, taken, *rates = SlotBelief.of_observation(observation).observations
+        slots, _, taken, hit, false_alarm = SlotBelief.of_observation(observation).observations
         evidence = np.zeros(len(slots))
         if "cues" in observation:
             evidence = observation["cues"].reshape(3, -1)[2, slots].astype(np.float64)
-        return cls(int(observation["vertex"]), float(observation["time"][1]), slots, taken, *rates, evidence)
+        vertex, time = int(observation["vertex"]), float(observation["time"][1])
+        return cls(vertex, time, slots, taken, hit, false_alarm, evidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,14 +157,13 @@ class Simulations:
 
     def observation(self, i: int = 0) -> Observation:
         rows, record = self.searches.step_observed[i], self.searches.records[i]
-        of_slots, taken, *rates = rows[:, : int(record["n_step_observed"])].astype(np.float64)
+        of_slots, taken, hit, false_alarm = rows[:, : int(record["n_step_observed"])].astype(np.float64)
         slots, evidence = of_slots.astype(np.int64), np.zeros(len(of_slots))
         if len(self.searches.cue_table):
             cues = self.searches.cue_table[i][self.searches.columns[i][slots]]
             evidence = np.where(cues["at"] == record["time"], cues["evidence"], 0.0)
-        return Observation(
-            int(record["vertex"]), float(record["clock"][1]), slots, taken == 1.0, *rates, evidence
-        )
+        vertex, time = int(record["vertex"]), float(record["clock"][1])
+        return Observation(vertex, time, slots, taken == 1.0, hit, false_alarm, evidence)
 
     def step(self, actions: IntArray) -> tuple[FloatArray, BoolArray]:
         """Take an action, (n,) int64, in each search in place; return costs, (n,) s, and which are over, (n,) bool.

@@ -7,6 +7,8 @@ crosses the edge within 600 m is assumed. Service roads that lead to no parking 
 limit over 30 km/h: where 30 is allowed, cars drive at the scenario's speed.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
