@@ -159,6 +159,19 @@ def test_a_car_that_moves_out_is_in_the_way_until_it_is_out():
     assert waits > 3
 
 
+def test_the_bound_is_clairvoyant_and_the_oracle_near_it():
+    scenario = busy(Cues(20.0), p=0.98, stay_s=1200.0)
+    bound, agent = make_agent("bound", scenario), make_agent("oracle", scenario)
+    env, over = gym.make("parkenv/Search-v2", scenario=scenario), []
+    for seed in range(10):
+        env.reset(seed=seed)
+        state = env.unwrapped.state
+        least_s = bound.of_world(state.world, state.vertex, state.time)
+        over.append(parkenv.simulate(env, agent, seed=seed).info["total_s"] - least_s)
+    assert min(over) > -1e-6
+    assert np.median(over) < 2.0
+
+
 def test_single_batched_local_and_copied_searches_observe_the_same():
     scenario = busy(Cues(60.0, 0.8, 0.05))
     env = gym.make("parkenv/Search-v2", scenario=scenario)

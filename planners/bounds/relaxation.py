@@ -107,10 +107,10 @@ class SearchBound:
     def of_world(self, world: World, vertex: int, time: float) -> float:
         """Return the bound of one world, s; their mean is the bound, a single search may take less.
 
-        Where the law of the slots is not known, as in a log, it is the clairvoyant bound. The search begins at `vertex`
-        at `time`, s since Monday 00:00.
+        Where the law of the slots is not known, as in a log, or cars show that they leave, it is the clairvoyant bound.
+        The search begins at `vertex` at `time`, s since Monday 00:00.
         """
-        law = world.law()
+        law = None if self._problem.cues is not None else world.law()
         if law is None:
             best = best_slot(self._problem, self._routes, world, vertex, time)
             return min(best.total_s, self._problem.give_up_s)
