@@ -10,7 +10,7 @@ from scipy.special import logit
 from parkenv import InputError
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.event_table import is_counts
-from parkenv.forecast.usual_days import usual_days
+from parkenv.forecast.typical_week_fit import usual_days
 
 CAPACITY = 200
 FIRST = date(2024, 3, 1)

@@ -13,9 +13,8 @@ from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, naming, require
 from parkenv.files.limited_reading import csv_rows
 from parkenv.files.option import columns_in
@@ -61,9 +60,9 @@ class Readings(NamedTuple):
     car_parks: tuple[str, ...]  # (c,) names, ascending
     first: date
     n_days: int
-    park: NDArray[np.int64]  # index of the car park
-    day: NDArray[np.int64]  # days since the first
-    hour: NDArray[np.int64]  # of the day
+    park: IntArray  # index of the car park
+    day: IntArray  # days since the first
+    hour: IntArray  # of the day
     second: FloatArray  # float64, s since the first day's midnight, of the time in the table
     capacity: FloatArray  # float64, places
     free: FloatArray  # float64, places; NaN if unknown

@@ -36,9 +36,8 @@ from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError, nearest
 from parkenv.forecast.count_table import DAY_S, FINE, HOURS, Capacity, Readings, read_table
 
@@ -96,7 +95,7 @@ class Counts:
         return self.capacity * self.per_hour
 
     @cached_property
-    def weekday(self) -> NDArray[np.int64]:
+    def weekday(self) -> IntArray:
         return np.array([day.weekday() for day in self.days])
 
     def day_index(self, day: date) -> int:
@@ -133,9 +132,7 @@ class Counts:
                 raise InputError(f"{self.source}: has no car park {name!r}; {nearest(name, self.car_parks)}")
         return self.part([self.car_parks.index(name) for name in names])
 
-    def part(
-        self, rows: Sequence[int] | NDArray[np.int64], first: int = 0, last: int | None = None
-    ) -> Counts:
+    def part(self, rows: Sequence[int] | IntArray, first: int = 0, last: int | None = None) -> Counts:
         days = slice(first, last)
         names, faults = zip(*((self.car_parks[i], self.faults[i]) for i in rows), strict=True)
         capacity, occupied, seen = (array[rows, days] for array in (self.capacity, self.occupied, self.seen))
@@ -213,7 +210,7 @@ def _summer_time(days: tuple[date, ...], zone: ZoneInfo) -> dict[int, int]:
     return changes
 
 
-def _by_hour(readings: Readings, changes: dict[int, int]) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+def _by_hour(readings: Readings, changes: dict[int, int]) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return capacities (c, d), the last of each day, readings (c, d, 24), and the number of duplicates (c,)."""
     c, d = len(readings.car_parks), readings.n_days
     known = np.isfinite(readings.free) & (readings.capacity > 0) & np.isfinite(readings.capacity)

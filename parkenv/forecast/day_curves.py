@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, gammaln, logit
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.forecast.count_table import HOURS
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_forecast import DIAGONAL, FREEDOM, DayForecast, calibrated, logits
@@ -86,10 +86,8 @@ class _Filter:
     def __init__(self, n: int, settings: CurveSettings) -> None:
         s = settings
         own = np.r_[s.day_level_spread, s.day_spread * _SMOOTH[1:]]
-        start = np.r_[2.0, _SMOOTH[1:]]
-        start = np.r_[
-            start, np.tile(s.class_spread * _SMOOTH, 2), np.tile(s.weekday_spread * _SMOOTH, 5), own
-        ]
+        classes, weekdays = np.tile(s.class_spread * _SMOOTH, 2), np.tile(s.weekday_spread * _SMOOTH, 5)
+        start = np.r_[2.0, _SMOOTH[1:], classes, weekdays, own]
         self._drift = np.r_[
             s.level_drift,
             s.common_drift * _SMOOTH[1:],
@@ -155,7 +153,7 @@ class _Fit(NamedTuple):
     distance: FloatArray
     log_det: FloatArray
 
-    def log_likelihood(self, n: NDArray[np.int64]) -> FloatArray:
+    def log_likelihood(self, n: IntArray) -> FloatArray:
         """Return the log-likelihood (c,) of n observed hours, multivariate t, up to what all curves share."""
         return np.asarray(
             gammaln((FREEDOM + n) / 2)
@@ -200,13 +198,11 @@ class SpecialDays:
         self._n = n
         self._known: dict[Hashable, tuple[NDArray[np.float64], float]] = {}
 
-    def expected(self, day: date) -> NDArray[np.bool_]:
+    def expected(self, day: date) -> BoolArray:
         evidence, share = self._known.get(key_of(day), (np.zeros(self._n), _RARE))
         return np.asarray(logit(share) + np.clip(evidence, -_OWN, _OWN) > 0)
 
-    def observe(
-        self, day: date, evidence: NDArray[np.float64], observed: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
+    def observe(self, day: date, evidence: NDArray[np.float64], observed: BoolArray) -> BoolArray:
         """Take in a day, and return the car parks (n,) where it clearly was as a Sunday.
 
         `evidence`, (n,), is the log-likelihood of the day as a Sunday minus that as its own weekday; `observed`, (n,),

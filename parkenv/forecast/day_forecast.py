@@ -121,9 +121,22 @@ def day_means(fractions: FloatArray, observed: BoolArray) -> FloatArray:
     return np.asarray((np.nan_to_num(fractions) * weight).sum(axis=-1))
 
 
-def holds(occupied: FloatArray, low: FloatArray, high: FloatArray, capacity: FloatArray) -> BoolArray:
-    half = 0.5 / capacity
-    return np.asarray((occupied >= low - half) & (occupied <= high + half))
+def held(
+    mean: FloatArray,
+    covariance: NDArray[Any],
+    occupied: FloatArray,
+    observed: BoolArray,
+    capacity: FloatArray,
+) -> tuple[BoolArray, BoolArray]:
+    """Return whether the 90 % intervals of a day hold what was observed: of its mean (c,), of its hours (c, 24)."""
+    draws, half = draw_days(mean, covariance), 0.5 / capacity
+
+    def inside(values: FloatArray, drawn: FloatArray, half: FloatArray) -> BoolArray:
+        low, high = np.quantile(drawn, INTERVAL, axis=1)
+        return np.asarray((values >= low - half) & (values <= high + half))
+
+    days = inside(day_means(occupied, observed), day_means(draws, observed), half)
+    return days, inside(occupied, draws, half[:, None])
 
 
 def calibrated(forecast: DayForecast, counts: Counts, until: int | None = None) -> DayForecast:
@@ -143,12 +156,9 @@ def calibrated(forecast: DayForecast, counts: Counts, until: int | None = None) 
         rows = np.flatnonzero(observed.sum(axis=1) >= MIN_HOURS)
         if rows.size and (until is None or day < until):
             y, o, places = occupied[rows], observed[rows], counts.capacity[rows, day]
-            days = draw_days(mean[rows], spread[rows])
-            low, high = np.quantile(day_means(days, o), INTERVAL, axis=1)
-            levels.update(rows, band[rows], (~holds(day_means(y, o), low, high, places)).astype(float))
-            low, high = np.quantile(days, INTERVAL, axis=1)
-            missed = ~holds(y, low, high, places[:, None]) & o
-            hours.update(rows, band[rows], missed.sum(axis=1) / o.sum(axis=1))
+            days_held, hours_held = held(mean[rows], spread[rows], y, o, places)
+            levels.update(rows, band[rows], (~days_held).astype(float))
+            hours.update(rows, band[rows], (~hours_held & o).sum(axis=1) / o.sum(axis=1))
     return replace(forecast, covariance=covariance)
 
 

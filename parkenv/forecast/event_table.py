@@ -22,7 +22,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -240,12 +240,9 @@ class _Table:
             earlier = np.append(-np.inf, np.where(table.same, table.end, -np.inf))[:-1]
             begin = np.maximum(table.start - BEFORE_S, earlier) if is_since else earlier
             known = np.isfinite(begin)
-            table = _Rows(
-                np.append(table.bay, table.bay[known]),
-                np.append(table.start, begin[known]),
-                np.append(table.end, table.start[known]),
-                np.append(table.taken, ~table.taken[known]),
-            )
+            other = table._replace(start=begin, end=table.start, taken=~table.taken).kept(known)
+            both: Any = map(np.append, table, other)
+            table = _Rows(*both)
             table = self._dropped("dead", table, table.end - table.start > MAX_STATE_S)
         order = np.lexsort((table.start, table.bay))
         return table.kept(order[looks | (table.end > table.start)[order]])

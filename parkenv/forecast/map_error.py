@@ -18,11 +18,10 @@ from functools import reduce
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import expit
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.files.field_types import NotNegative, NumberOrInf, Positive, Validated
 from parkenv.forecast.logistic_normal import EVEN
 
@@ -73,7 +72,7 @@ class MapErrorPrior(Validated):
 class Evidence:
     """What the observations of one day say about k states of slots, each taken or free."""
 
-    slots: NDArray[np.int64]  # (k,) int64
+    slots: IntArray  # (k,) int64
     hours: FloatArray  # (k,) float64, hours since Monday 00:00, when each state was observed
     # (k, 2) float64, probability of its observations if the slot was free, and if it was taken
     likelihood: FloatArray
@@ -179,7 +178,7 @@ class MapError:
         both = [np.sqrt(np.einsum("kd,d->k", self._covariance @ a, a)) for a in (level, slope)]
         return both[0], both[1]
 
-    def _knots(self, hours: FloatArray) -> list[tuple[NDArray[np.int64], FloatArray]]:
+    def _knots(self, hours: FloatArray) -> list[tuple[IntArray, FloatArray]]:
         """Return the two parts of g between which each of the hours, (k,), lies, and their shares, (k,) each."""
         first = len(self._nearness) + HOURS * (np.floor(hours / HOURS) % 7 >= 5)
         # Knots are in the middle of their hours.

@@ -15,15 +15,7 @@ from scipy.special import expit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.forecast.counts import Counts
-from parkenv.forecast.day_forecast import (
-    INTERVAL,
-    MIN_HOURS,
-    DayForecast,
-    day_means,
-    draw_days,
-    holds,
-    quantiles_of_t,
-)
+from parkenv.forecast.day_forecast import MIN_HOURS, DayForecast, day_means, held, quantiles_of_t
 
 BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)  # bands of fullness
 
@@ -89,12 +81,10 @@ class Scores:
         values = quantiles_of_t()[:, None, None]
         for day in range(d):
             crps[:, day] = crps_of_equally_likely(expit(mean[:, day] + sd[:, day] * values), y[:, day])
-            draws = draw_days(mean[:, day], forecast.covariance[:, day])
-            low, high = np.quantile(draws, INTERVAL, axis=1)
-            hour_covered[:, day] = holds(y[:, day], low, high, places[:, day, None])
             o, rows = observed[:, day], enough[:, day]
-            low, high = np.quantile(day_means(draws, o), INTERVAL, axis=1)
-            inside = holds(day_means(y[:, day], o), low, high, places[:, day])
+            inside, hour_covered[:, day] = held(
+                mean[:, day], forecast.covariance[:, day], y[:, day], o, places[:, day]
+            )
             day_covered[rows, day] = inside[rows]
             day_forecast[rows, day] = day_means(p[:, day], o)[rows]
         flat = (c * d, y.shape[2])

@@ -1,22 +1,23 @@
-"""Condense counts of many car parks to a typical week, and how car parks and days differ from it."""
+"""What counts usually are: the typical week of many car parks, how these differ from it, and days of a class."""
 
 import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.errors import require
 from parkenv.forecast.counts import Counts
 
 LEVEL_SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # shares of all car parks whose levels are reported
 LEAST_READINGS = 20  # number of readings below which an hour of the week has no mean
 BY_DAY = slice(8, 20)  # hours that the level of a car park, or of a day, is measured by
 WORKDAYS = 5
-_CLIP = 0.005  # a mean of exactly 0 or 1 has no logit
+_CLIP = 0.005  # an occupancy of exactly 0 or 1 has no logit
 _ITERATIONS = 50
+_PRIOR_SD, _PRIOR_DAYS = 0.8, 2.0  # logits, assumed between days, with the weight of so many days
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ def _weeks(counts: Counts) -> FloatArray:
     return weeks
 
 
-def _day_error(occupied: FloatArray, week: FloatArray, weekday: NDArray[np.int64]) -> float:
+def _day_error(occupied: FloatArray, week: FloatArray, weekday: IntArray) -> float:
     """Return the standard deviation of the shifts, logits, that give the week the mean of each weekday by day."""
     shifts = []
     for day in np.flatnonzero(weekday < WORKDAYS):
@@ -72,3 +73,35 @@ def _day_error(occupied: FloatArray, week: FloatArray, weekday: NDArray[np.int64
             wanted = float(np.clip(readings[known].mean(), _CLIP, 1.0 - _CLIP))
             shifts.append(brentq(lambda s, c=centre, w=wanted: expit(c + s).mean() - w, -15.0, 15.0))
     return float(np.std(shifts)) if len(shifts) >= LEAST_READINGS else np.nan
+
+
+def usual_days(occupied: FloatArray, weekday: IntArray, source: str) -> tuple[FloatArray, FloatArray]:
+    """Forecast each day of a car park from all others, before and after it, but not from the day itself.
+
+    From fractions of taken places, (d, 24), and days of the week, (d,): mean and standard deviation of the error of the
+    occupancy's logit, (d, 24) each. Monday to Friday, Saturdays and Sundays differ; a day that is the only one of its
+    class is forecast from all others.
+    """
+    y = logit(np.clip(occupied, _CLIP, 1.0 - _CLIP))
+    days = np.flatnonzero(np.isfinite(y).any(axis=1))
+    require(
+        days.size > 1, f"{source}: counted on {days.size} days, want at least two, or more with replay_from"
+    )
+    kind = np.clip(weekday - 4, 0, 2)
+    mean, sd = np.full(y.shape, np.nan), np.full(y.shape, np.nan)
+    for day in range(len(y)):
+        others = days[days != day]
+        alike = others[kind[others] == kind[day]]
+        mean[day], sd[day] = _of(y[alike if alike.size else others])
+    return mean, sd
+
+
+def _of(y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    known = np.isfinite(y)
+    n = known.sum(axis=0)
+    mean = np.divide(np.where(known, y, 0.0).sum(axis=0), n, where=n > 0, out=np.full(n.shape, np.nan))
+    squares = (np.where(known, y - mean, 0.0) ** 2).sum(axis=0)
+    variance = (_PRIOR_DAYS * _PRIOR_SD**2 + squares) / (_PRIOR_DAYS + np.maximum(n - 1, 0))
+    sd = np.sqrt(variance * (1.0 + 1.0 / np.maximum(n, 1)))
+    hour, at = np.arange(n.size), np.flatnonzero(n)
+    return np.interp(hour, at, mean[at]), np.interp(hour, at, sd[at])

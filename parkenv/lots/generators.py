@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import require_number, require_whole
 from parkenv.world.drive_graph import LANE_OFFSET, SLOT_REACH
 from parkenv.world.lot import Lane, Mouth, ParkingLot, corner_points, mouth_heading, mouth_points
@@ -240,9 +240,9 @@ class StreetGrid:
 
     crossings: FloatArray  # (n_along, n_across, 2) m, crossing of street i along and street j across
     # (n_along,) int: 0 for a two-way street, 1 for a one-way street eastward, -1 westward
-    along: NDArray[np.int64]
+    along: IntArray
     # (n_across,) int: 0 for a two-way street, 1 for a one-way street northward, -1 southward
-    across: NDArray[np.int64]
+    across: IntArray
 
     def lanes(self) -> list[Lane]:
         streets = [*self.crossings, *self.crossings.swapaxes(0, 1)]

@@ -197,7 +197,12 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
     Rows of an area are back to back; a single one opens to the nearer aisle. Aisles are the waypoint rows R1 to R4,
     dead ends in the east; C1 and C2 connect them. Cars enter by EXT; the goal is a door at the southern end of C2.
     """
-    document: Any = _MAP.parse(read_yaml(path), str(path))
+    document = _MAP.parse(read_yaml(path), str(path))
+    with naming(path):
+        return _lot(document)
+
+
+def _lot(document: Any) -> ParkingLot:
     lines = {name: np.array(line.bounds) for name, line in document.WAYPOINTS}
     aisle_y = np.array([lines[f"R{k}L"][0, 1] for k in (1, 2, 3, 4)])
     c1, c2 = lines["C1"][0, 0], lines["C2"][0, 0]
@@ -225,15 +230,14 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
             else:
                 parts.append(bay_row((west, south), 0.0, n_columns, size=size))
             slot_ids += [f"{name}-{row}-{column}" for column in range(n_columns)]
-    with naming(path):
-        return ParkingLot(
-            name="dragon-lake",
-            slot_ids=tuple(slot_ids),
-            **Slots.joined(parts).columns(),
-            lanes=tuple(lanes),
-            entries=outside[None],
-            goals=np.array([[80.0, -4.0]]),
-        )
+    return ParkingLot(
+        name="dragon-lake",
+        slot_ids=tuple(slot_ids),
+        **Slots.joined(parts).columns(),
+        lanes=tuple(lanes),
+        entries=outside[None],
+        goals=np.array([[80.0, -4.0]]),
+    )
 
 
 # Distance, m: a lane that ends closer to another one without a common point was probably meant to join it.
@@ -363,16 +367,14 @@ def _reach(lot: ParkingLot) -> tuple["csr_array[np.float64]", BoolArray, BoolArr
     return graph, np.isfinite(reached), np.isfinite(to_slot)
 
 
-def dead_ends(lot: ParkingLot) -> list[str]:
+def dead_ends(lot: ParkingLot) -> Iterator[str]:
     """Name places from which no lane leads on, or none to a slot, although cars get there."""
     graph, reached, to_slot = _reach(lot)
     exits = np.diff(graph.tocsr().indptr) == 0
-    texts = []
     for vertex in np.flatnonzero(reached & (exits | ~to_slot)).tolist():
         x, y = lot.vertex_xy[vertex]
         what = "no lane leads on" if exits[vertex] else "no slot can be reached any more"
-        texts.append(f"one-way lanes have a dead end at ({x:.1f}, {y:.1f}) m: {what}")
-    return texts
+        yield f"one-way lanes have a dead end at ({x:.1f}, {y:.1f}) m: {what}"
 
 
 def _reach_warnings(

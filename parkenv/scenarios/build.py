@@ -292,7 +292,7 @@ def _recorded(
 
 
 def _counted(occupancy: OccupancySpec, spec: CountsSpec, lot: ParkingLot, goal: int) -> OccupancyModel:
-    from parkenv.forecast.usual_days import usual_days
+    from parkenv.forecast.typical_week_fit import usual_days
     from parkenv.world.occupancy.counted import CountedOccupancy, car_park_of_slots, log_of_counts
 
     counts, first = _counts(*_file_of(spec)), occupancy.replay_from

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -108,7 +108,7 @@ class Centrelines:
     leg_segment: IntArray  # (n_legs,)
     segment_nodes: IntArray  # (n_segments, 2) node at the start and at the end
     segment_stations: FloatArray  # (n_segments, 2)
-    segment_oneway: NDArray[np.bool_]  # (n_segments,)
+    segment_oneway: BoolArray  # (n_segments,)
     segment_speed: FloatArray  # (n_segments,)
     node_xy: FloatArray  # (n_nodes, 2)
 
@@ -165,20 +165,11 @@ def build_drive_graph(
     start = lines.leg_start[leg]
     on_lane = lines.xy[start] + (station - lines.station[start])[:, None] * lines.leg_tangent[leg]
 
-    along = _chain_edges(lines, station, tangent, chain, order, n_slots)
+    along = _chain_edges(lines, station, tangent, chain, order)
     along, node = _turning_edges(lines.chains, turns, along, n_slots)
     edges = [along, *_crossing_edges(lines, station, side * tangent, segment, against)]
-    source, target, length, bearing, of = (np.concatenate(part) for part in zip(*edges, strict=True))
-    neighbors, edge_length, edge_speed = _four_columns(
-        n_slots + len(node),
-        n_slots,
-        lines.node_xy,
-        source,
-        target,
-        length,
-        bearing,
-        lines.segment_speed[of // 2],
-    )
+    every: Any = tuple(np.concatenate(part) for part in zip(*edges, strict=True))
+    neighbors, edge_length, edge_speed = _four_columns(lines, n_slots, n_slots + len(node), every)
     vertex_yaw = np.zeros(n_slots + len(node))
     vertex_yaw[:n_slots] = np.arctan2(tangent[:, 1], tangent[:, 0])
     return DriveGraph(
@@ -211,7 +202,7 @@ def _with_entry_points(
             reason = (
                 f"is {distance[nearest_line]:.1f} m from the nearest lane, want at most {ENTRY_REACH:g} m"
             )
-            problems.append(GraphProblem("entry", i, reason, (float(xy[0]), float(xy[1]))))
+            problems.append(GraphProblem("entry", i, reason, tuple(xy.tolist())))
             continue
         k, j = at[nearest_line]
         line, (centre, oneway, speed) = lines[nearest_line], parts[k][j]
@@ -230,6 +221,16 @@ def _with_entry_points(
     if problems:
         raise GraphError(problems)
     return [part for lane in parts for part in lane], points
+
+
+def nearest_legs(ends: FloatArray, points: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return which straight leg, of ends (n, 2, 2) m, is nearest to each point, and how far it is, m, (k,) each."""
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(ends)))
+    (index, leg), distance = tree.query_nearest(
+        shapely.points(points), all_matches=False, return_distance=True
+    )
+    order = np.argsort(index)
+    return leg[order].astype(np.int64), distance[order]
 
 
 def linestrings(parts: Sequence[FloatArray]) -> NDArray[np.object_]:
@@ -295,27 +296,21 @@ def centrelines(lanes: Sequence[LaneParts]) -> Centrelines:
     )
 
 
-def _attach_slots(lines: Centrelines, mouth_xy: FloatArray) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
+def _attach_slots(lines: Centrelines, mouth_xy: FloatArray) -> tuple[FloatArray, IntArray, BoolArray]:
     """Station, leg and side (True: left of the lane's direction) of the lane point nearest to each mouth."""
     start = lines.leg_start
-    ends = np.stack([lines.xy[start], lines.xy[start + 1]], axis=1)
-    tree = shapely.STRtree(np.asarray(shapely.linestrings(ends)))
-    (index, leg), distance = tree.query_nearest(
-        shapely.points(mouth_xy), all_matches=False, return_distance=True
-    )
+    leg, distance = nearest_legs(np.stack([lines.xy[start], lines.xy[start + 1]], axis=1), mouth_xy)
     problems = [
         GraphProblem(
             "slot",
-            int(i),
-            f"is on no lane: the nearest is {d:.1f} m from its mouth, want at most {SLOT_REACH:g} m",
-            (float(mouth_xy[i, 0]), float(mouth_xy[i, 1])),
+            i,
+            f"is on no lane: the nearest is {distance[i]:.1f} m from its mouth, want at most {SLOT_REACH:g} m",
+            tuple(mouth_xy[i].tolist()),
         )
-        for i, d in zip(index, distance, strict=True)
-        if d > SLOT_REACH
+        for i in np.flatnonzero(distance > SLOT_REACH).tolist()
     ]
     if problems:
         raise GraphError(problems)
-    leg = leg[np.argsort(index)].astype(np.int64)
     away = mouth_xy - lines.xy[start[leg]]
     tangent = lines.leg_tangent[leg]
     leg_length = lines.station[start[leg] + 1] - lines.station[start[leg]]
@@ -354,14 +349,10 @@ Edges = tuple[IntArray, IntArray, FloatArray, FloatArray, IntArray]
 
 
 def _chain_edges(
-    lines: Centrelines,
-    station: FloatArray,
-    tangent: FloatArray,
-    chain: IntArray,
-    order: IntArray,
-    n_slots: int,
+    lines: Centrelines, station: FloatArray, tangent: FloatArray, chain: IntArray, order: IntArray
 ) -> Edges:
     """Edges along every chain, node to slots to node: sources, targets, lengths, m, bearings, rad, and chains."""
+    n_slots = len(order)
     chains = np.flatnonzero(lines.chains.drivable)
     first_node, last_node, leaving = (values[chains] for values in lines.chains[:3])
     # Stations grow along even chains.
@@ -413,11 +404,7 @@ def _turning_edges(
 
 
 def _crossing_edges(
-    lines: Centrelines,
-    station: FloatArray,
-    tangent: FloatArray,
-    segment: IntArray,
-    against: NDArray[np.bool_],
+    lines: Centrelines, station: FloatArray, tangent: FloatArray, segment: IntArray, against: BoolArray
 ) -> list[Edges]:
     edges = []
     two_way = ~lines.segment_oneway[segment]
@@ -446,25 +433,18 @@ _CHUNK = 65536
 
 
 def _four_columns(
-    n_vertices: int,
-    n_slots: int,
-    node_xy: FloatArray,
-    source: IntArray,
-    target: IntArray,
-    length: FloatArray,
-    bearing: FloatArray,
-    speed: FloatArray,
+    lines: Centrelines, n_slots: int, n_vertices: int, edges: Edges
 ) -> tuple[NDArray[np.int32], FloatArray, FloatArray]:
     """Assign the edges of every vertex to the columns up, down, left, right with the least total bearing error.
 
     The assignment problem has at most 4! solutions, so all are tried, for many vertices at once.
     """
-    order = np.argsort(source, kind="stable")
-    source, target, length, bearing = source[order], target[order], length[order], bearing[order]
+    order = np.argsort(edges[0], kind="stable")
+    source, target, length, bearing, of = (column[order] for column in edges)
     degree = np.bincount(source, minlength=n_vertices)
-    crowded = np.flatnonzero(degree[: n_slots + len(node_xy)] > 4)
+    crowded = np.flatnonzero(degree[: n_slots + len(lines.node_xy)] > 4)
     if len(crowded):
-        crowded_xy = node_xy[crowded - n_slots].tolist()
+        crowded_xy = lines.node_xy[crowded - n_slots].tolist()
         raise GraphError(
             [
                 GraphProblem(
@@ -490,7 +470,7 @@ def _four_columns(
     neighbors = np.full((n_vertices, 4), -1, dtype=np.int32)
     edge_length, edge_speed = np.zeros((n_vertices, 4)), np.ones((n_vertices, 4))
     at = source, column[source, rank]
-    neighbors[at], edge_length[at], edge_speed[at] = target, length, speed[order]
+    neighbors[at], edge_length[at], edge_speed[at] = target, length, lines.segment_speed[of // 2]
     return neighbors, edge_length, edge_speed
 
 

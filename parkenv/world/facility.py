@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-import shapely
 from pydantic import BeforeValidator, Field
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, require_one_of
 from parkenv.files.field_types import Name, NotNegative, Number, Validated, Whole
-from parkenv.world.drive_graph import GraphError, GraphProblem, linestrings
+from parkenv.world.drive_graph import GraphError, GraphProblem, nearest_legs
 
 FACILITY_KINDS = ("kerb", "lot", "garage")
 # What drivers know of a facility: what they find out by trying; a full sign in view; a live count everywhere.
@@ -68,14 +67,9 @@ def nominal_slots(
     facility out of reach of all lanes is a GraphError.
     """
     legs = np.concatenate([np.stack([points[:-1], points[1:]], axis=1) for points in lanes])
-    tree = shapely.STRtree(linestrings(list(legs)))
     counted = [i for i, facility in enumerate(facilities) if facility.is_counted]
     points = np.array([facilities[i].xy for i in counted])
-    (index, leg), distance = tree.query_nearest(
-        shapely.points(points), all_matches=False, return_distance=True
-    )
-    order = np.argsort(index)
-    leg, distance = leg[order], distance[order]
+    leg, distance = nearest_legs(legs, points)
     far = [
         facility_problem(
             facilities[i], i, f"is {d:.0f} m from the nearest lane, want at most {FACILITY_REACH:g} m"

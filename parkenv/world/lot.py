@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError, naming, nearest, require
 from parkenv.files.field_types import Flag, Number, Validated, as_array
 from parkenv.files.file_names import is_plain
@@ -186,11 +186,11 @@ class ParkingLot(_ByValue):
     neighbors: NDArray[np.int32] = field(init=False)
     edge_length: FloatArray = field(init=False)
     edge_speed: FloatArray = field(init=False)
-    entry_vertices: NDArray[np.int64] = field(init=False)
+    entry_vertices: IntArray = field(init=False)
     zones: tuple[str, ...] = field(init=False)
-    zone_of_slot: NDArray[np.int64] = field(init=False)
-    facility_of_slot: NDArray[np.int64] = field(init=False)
-    capacity: NDArray[np.int64] = field(init=False)
+    zone_of_slot: IntArray = field(init=False)
+    facility_of_slot: IntArray = field(init=False)
+    capacity: IntArray = field(init=False)
     classes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -334,7 +334,7 @@ class ParkingLot(_ByValue):
         return -1 if self.left_hand else 1
 
     @property
-    def is_counted(self) -> NDArray[np.bool_]:
+    def is_counted(self) -> BoolArray:
         """Whether each slot stands for a counted facility, (n_slots,) bool."""
         counted = np.array([*(facility.is_counted for facility in self.facilities), False])
         return counted[self.facility_of_slot]

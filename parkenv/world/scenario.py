@@ -200,12 +200,10 @@ class SearchProblem(Validated):
     def admits(self, drivers: Drivers) -> BoolArray:
         """Return whether drivers may park in each of the lot's zones, (..., n_zones) bool."""
         arrival, stay, classes = np.broadcast_arrays(drivers.arrival_s, drivers.stay_s, drivers.classes)
-        known = self.lot.classes
-        allowed = []
-        for zone in self.zone_rules:
-            users = sum(1 << i for i, name in enumerate(known) if name in zone.users)
-            allowed.append(((classes.astype(np.int64) & users) != 0) & zone.admits(arrival, stay))
-        return np.stack(allowed, axis=-1)
+        known, zones = list(enumerate(self.lot.classes)), self.zone_rules
+        users = np.array([sum(1 << i for i, name in known if name in zone.users) for zone in zones])
+        is_user = (classes.astype(np.int64)[..., None] & users) != 0
+        return np.asarray(is_user & np.stack([zone.admits(arrival, stay) for zone in zones], axis=-1))
 
     @property
     def is_priced(self) -> bool:
@@ -265,7 +263,7 @@ class SearchProblem(Validated):
         return _read_only(masks)
 
     @cached_property
-    def slots_in_view(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def slots_in_view(self) -> tuple[IntArray, IntArray]:
         """Slots in view, as (starts, slots): for vertex v `slots[starts[v]:starts[v + 1]]`, ascending.
 
         Counted facilities without a sign are in view of no vertex.
@@ -284,7 +282,7 @@ class SearchProblem(Validated):
         return _read_only(starts.astype(np.int64)), _read_only(slot[order].astype(np.int64))
 
     @property
-    def live_slots(self) -> NDArray[np.int64]:
+    def live_slots(self) -> IntArray:
         """Slots of counted facilities with a live count."""
         return self._counted("live")
 
@@ -301,18 +299,18 @@ class SearchProblem(Validated):
         metres = dijkstra(self.lot.drive_matrix(timed=True).T.tocsr(), indices=self.live_slots)
         return _read_only(metres / self.v_drive)
 
-    def _counted(self, known: str) -> NDArray[np.int64]:
+    def _counted(self, known: str) -> IntArray:
         facilities = [facility for facility in self.lot.facilities if facility.is_counted]
         there = np.flatnonzero([facility.known == known for facility in facilities])
         return self.lot.n_slots - len(facilities) + there
 
-    def in_view(self, vertex: int) -> NDArray[np.int64]:
+    def in_view(self, vertex: int) -> IntArray:
         """Return the slots in view of a vertex, ascending."""
         starts, slots = self.slots_in_view
         return slots[starts[vertex] : starts[vertex + 1]]
 
     @cached_property
-    def sight_lines(self) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def sight_lines(self) -> tuple[FloatArray, BoolArray]:
         """Distance, m, of each of `slots_in_view`, and whether it is beside the car.
 
         Distances are between vertices, like the view range. A slot is beside a car at a slot's vertex if it lies on its
@@ -424,7 +422,7 @@ class Scenario(SearchProblem):
         return (self.prior or self.occupancy).forecast(arrival)
 
 
-def drive_times(problem: SearchProblem, vertex: int | NDArray[np.int64]) -> FloatArray:
+def drive_times(problem: SearchProblem, vertex: int | IntArray) -> FloatArray:
     """Return the shortest drive time from a vertex, or several, to each slot's stop position, (..., n_slots) s.
 
     It is infinite where there is no way.
@@ -432,7 +430,7 @@ def drive_times(problem: SearchProblem, vertex: int | NDArray[np.int64]) -> Floa
     return drive_metres(problem.lot, vertex, timed=True) / problem.v_drive
 
 
-def drive_metres(lot: ParkingLot, vertex: int | NDArray[np.int64], *, timed: bool = False) -> FloatArray:
+def drive_metres(lot: ParkingLot, vertex: int | IntArray, *, timed: bool = False) -> FloatArray:
     """Return the shortest drive from a vertex, or several, to each slot, (..., n_slots) m; see `drive_matrix`."""
     metres = dijkstra(lot.drive_matrix(timed), indices=np.asarray(vertex))
     return np.asarray(metres[..., : lot.n_slots])

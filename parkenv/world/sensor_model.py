@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError, require, require_one_of
 from parkenv.files.field_types import Flag, NotNegative, Probability, Validated
 from parkenv.files.limited_reading import JsonFormat
@@ -125,7 +124,7 @@ class SensorModel(Validated):
         """Whether all observations are error-free."""
         return not self.bands and self.hit_rate == 1.0 and self.false_alarm_rate == 0.0
 
-    def rates(self, distance: FloatArray, beside: NDArray[np.bool_]) -> SensorRates:
+    def rates(self, distance: FloatArray, beside: BoolArray) -> SensorRates:
         """Return the rates of slots at given distances, (k,) m, beside the car or not, (k,) bool."""
         k = len(distance)
         rates = SensorRates(np.ones(k), np.full(k, self.hit_rate), np.full(k, self.false_alarm_rate))

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.files.field_types import Validated, Whole
 from parkenv.world.lot import ParkingLot
 
@@ -191,7 +190,7 @@ class _Routes:
         return np.asarray(self._lot.vertex_xy[vertices[::-1]]).reshape(-1, 2)
 
 
-def clear_of(ego: FloatArray, pose: FloatArray, half: FloatArray) -> NDArray[np.bool_]:
+def clear_of(ego: FloatArray, pose: FloatArray, half: FloatArray) -> BoolArray:
     offset = pose[:, :2] - ego[:2]
     c, s = np.cos(ego[2]), np.sin(ego[2])
     local = np.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]], axis=1)

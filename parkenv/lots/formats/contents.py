@@ -94,20 +94,14 @@ class LotContents:
     errors: list[LotProblem] = field(default_factory=list)
 
     def columns(self) -> dict[str, Any]:
+        as_they_are = ("name", "slot_ids", "lanes", "walls", "facilities", "zone_rules", "turns", "left_hand")
         return {
-            "name": self.name,
-            "slot_ids": tuple(self.slot_ids),
+            **{name: getattr(self, name) for name in as_they_are},
             **self.slots.columns(),
-            "lanes": tuple(self.lanes),
             "entries": np.array(self.entries),
             "goals": np.array(self.goals),
-            "walls": tuple(self.walls),
-            "facilities": tuple(self.facilities),
-            "zone_rules": self.zone_rules,
             "goal_weights": self._weights("goal"),
             "entry_weights": self._weights("entry"),
-            "turns": tuple(self.turns),
-            "left_hand": self.left_hand,
         }
 
     def _weights(self, kind: str) -> dict[str, FloatArray]:
@@ -156,21 +150,14 @@ def graph_errors(contents: LotContents) -> list[LotProblem]:
                 return errors
             left[kind] = np.delete(left[kind], [problem.index for problem in error.problems])
         else:
-            return errors or _facility_errors(contents)
-
-
-def _facility_errors(contents: LotContents) -> list[LotProblem]:
-    if contents.errors or not contents.facilities:
-        return []
-    try:
-        ParkingLot(**contents.columns())
-    except GraphError as error:
-        numbers = contents.numbers["facility"]
-        return [
-            LotProblem("error", numbers[problem.index], f"facility {problem.message}")
-            for problem in error.problems
-        ]
-    return []
+            break
+    if not errors and not contents.errors and contents.facilities:
+        try:
+            ParkingLot(**contents.columns())
+        except GraphError as error:
+            numbers = contents.numbers["facility"]
+            errors += [LotProblem("error", numbers[p.index], f"facility {p.message}") for p in error.problems]
+    return errors
 
 
 _COUNTED = ("gate_s", "inside_s", "known", "delay_s")  # properties of counted facilities alone
@@ -223,9 +210,9 @@ def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray
                         raise InputError(
                             f"no property {member!r:.40} of facilities; {nearest(member, known)}"
                         )
-                absent = [member for member in _COUNTED if member in given and not given.get("capacity")]
-                if absent:
-                    raise InputError(f"{absent[0]} is of counted facilities, want a capacity, too")
+                counted = [member for member in _COUNTED if member in given]
+                if counted and not given.get("capacity"):
+                    raise InputError(f"{counted[0]} is of counted facilities, want a capacity, too")
                 require(str(name) not in seen, "its name appears already")
                 contents.facilities.append(
                     Facility(
@@ -234,7 +221,7 @@ def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray
                         zone=given.get("zone", ""),
                         capacity=given.get("capacity", 0),
                         xy=tuple(xy[feature.parts[0]][0].tolist()) if given.get("capacity") else None,
-                        **{member: given[member] for member in _COUNTED if member in given},
+                        **{member: given[member] for member in counted},
                     )
                 )
                 contents.numbers["facility"].append(feature.number)

@@ -291,13 +291,8 @@ def _check_feature(
             raise InputError(f"{kind}: {name} is {properties[name]!r:.40}, want true or false")
 
     coordinates = geometry.get("coordinates")
-    lines: Any
-    if shape == "Point":
-        lines, least = [[coordinates]], 1
-    elif shape == "LineString":
-        lines, least = [coordinates], 2
-    else:
-        lines, least = coordinates, 4
+    least = {"Point": 1, "LineString": 2}.get(str(shape), 4)
+    lines: Any = {"Point": [[coordinates]], "LineString": [coordinates]}.get(str(shape), coordinates)
     if not isinstance(lines, list) or not lines:
         raise InputError(f"{kind}: coordinates are {lines!r:.40}, want a list of rings")
     require(kind != "slot" or len(lines) == 1, f"slot: the polygon has {len(lines)} rings, want 1")

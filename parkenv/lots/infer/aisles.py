@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter, minimum_filter1d
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.lots.infer.spaces import Row, Spaces
 from parkenv.world.drive_graph import SLOT_REACH, component_labels
 
@@ -105,7 +105,7 @@ def _view(spaces: Spaces, shapes: NDArray[np.object_], tree: shapely.STRtree, ro
     return View(clear=np.minimum(clear[0], np.median(clear, axis=0)), hit=hits[0])
 
 
-def _runs(is_open: NDArray[np.bool_]) -> list[IntArray]:
+def _runs(is_open: BoolArray) -> list[IntArray]:
     runs: list[list[int]] = [[]]
     common = np.array([True, True])
     for i, sides in enumerate(is_open):
@@ -118,9 +118,7 @@ def _runs(is_open: NDArray[np.bool_]) -> list[IntArray]:
     return [np.array(run) for run in runs]
 
 
-def is_on_road(
-    spaces: Spaces, row: Row, side: int, view: View, roads: Sequence[FloatArray]
-) -> NDArray[np.bool_]:
+def is_on_road(spaces: Spaces, row: Row, side: int, view: View, roads: Sequence[FloatArray]) -> BoolArray:
     if not len(roads):
         return np.zeros(len(row), dtype=bool)
     mouths = row.mouths(spaces, side)
@@ -130,7 +128,7 @@ def is_on_road(
     return np.asarray(shapely.intersects(rays, lines))
 
 
-def _is_open(clear: FloatArray, row: Row) -> NDArray[np.bool_]:
+def _is_open(clear: FloatArray, row: Row) -> BoolArray:
     """Whether cars reach spaces from a side, (k,): where most of a row has the width that it needs, less is enough."""
     need = least_aisle(row)
     tolerated = TOLERATED if row.slant < np.radians(75.0) else TOLERATED_ACROSS
@@ -190,21 +188,18 @@ def _choose(
                 np.minimum(view.clear, 8.0).sum()
             )
     label = component_labels(np.array(list(pairs), dtype=np.int64), n) if n else np.empty(0, np.int64)
-    sides, sure = np.zeros(n, dtype=int), np.ones(n)
+    sides, cost, own = np.zeros(n, dtype=int), unary.copy(), np.arange(n)
     for part in np.unique(label):
         members = np.flatnonzero(label == part)
         inside = {pair: table for pair, table in pairs.items() if label[pair[0]] == part}
         sides[members] = _least_cost(unary[members], members, inside)
-        for r in members.tolist():
-            cost = unary[r].copy()
-            for (a, b), table in inside.items():
-                if r == a:
-                    cost += table[:, sides[b]]
-                elif r == b:
-                    cost += table[sides[a], :]
-            if np.isfinite(cost).all():
-                sure[r] = min(1.0, max(0.0, cost[1 - sides[r]] - cost[sides[r]]) / (0.6 * len(parts[r][0])))
-    return sides.tolist(), sure.tolist()
+    for (a, b), table in pairs.items():
+        cost[a] += table[:, sides[b]]
+        cost[b] += table[sides[a]]
+    with np.errstate(invalid="ignore"):
+        gain = cost[own, 1 - sides] - cost[own, sides]
+    sure = np.clip(gain / (0.6 * np.array([len(row) for row, _ in parts])), 0.0, 1.0)
+    return sides.tolist(), np.where(np.isfinite(cost).all(axis=1), sure, 1.0).tolist()
 
 
 def _least_cost(unary: FloatArray, members: IntArray, pairs: dict[tuple[int, int], FloatArray]) -> IntArray:
@@ -321,7 +316,7 @@ def _faced(rows: Sequence[OpenRow], owner: IntArray, r: int) -> IntArray:
     return result
 
 
-def _depth(part: OpenRow, is_faced: NDArray[np.bool_]) -> FloatArray:
+def _depth(part: OpenRow, is_faced: BoolArray) -> FloatArray:
     clear = part.view.clear
     depth = np.minimum(clear / 2, HALF_WIDTH if part.row.slant > np.radians(70.0) else NARROW_HALF_WIDTH)
     if is_faced.any():

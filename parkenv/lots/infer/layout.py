@@ -15,29 +15,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, QualityIssue
 from parkenv.lots.generators import Slots, nearest_on_lanes
+from parkenv.lots.infer import network
 from parkenv.lots.infer.aisles import Aisle, OpenRow, View, find_aisles, least_aisle, open_rows
-from parkenv.lots.infer.network import (
-    BEYOND_ENTRY,
-    Connection,
-    Entry,
-    FreeSpace,
-    Line,
-    connect,
-    corner_near,
-    directed,
-    entries_from_streets,
-    guess_entry,
-    largest_part,
-    limit_junctions,
-    noded,
-    without_stubs,
-)
 from parkenv.lots.infer.spaces import Spaces, find_rows
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.drive_graph import SLOT_REACH
@@ -61,8 +45,8 @@ class InferredLot:
     goal: FloatArray  # (1, 2) m, on the side of the entry
     rows: tuple[OpenRow, ...]
     aisles: tuple[Aisle, ...]
-    connections: tuple[Connection, ...]
-    entry: Entry | None
+    connections: tuple[network.Connection, ...]
+    entry: network.Entry | None
     two_way: tuple[int, ...]  # aisles that stay two-way against the slant of their spaces
     widened: int  # number of kerbside slots wider than their outlines
     left_out: dict[str, list[int]] = field(default_factory=dict)  # reason: spaces
@@ -71,7 +55,7 @@ class InferredLot:
 def infer_lot(
     spaces: Spaces,
     obstacles: Sequence[shapely.Geometry] = (),
-    roads: Sequence[Line] = (),
+    roads: Sequence[network.Line] = (),
     entries: FloatArray | None = None,
 ) -> InferredLot:
     """Infer a car park's lanes and entry from its spaces, beside `roads` of the map and known entries, (k, 2) m."""
@@ -85,28 +69,32 @@ def infer_lot(
         reasons = "; ".join(f"{len(members)} {reason}" for reason, members in left_out.items() if members)
         raise InputError(f"no aisle serves any of {len(spaces)} spaces: {reasons}")
     lines = [
-        Line(aisle.points if aisle.one_way >= 0 else aisle.points[::-1], aisle.one_way != 0, a)
+        network.Line(aisle.points if aisle.one_way >= 0 else aisle.points[::-1], aisle.one_way != 0, a)
         for a, aisle in enumerate(aisles)
     ]
-    connections = connect([line.points for line in (*lines, *roads)], FreeSpace(blocked), LONGEST_CONNECTION)
-    lines = noded(noded([*lines, *roads, *(Line(connection.points) for connection in connections)]))
+    connections = network.connect(
+        [line.points for line in (*lines, *roads)], network.FreeSpace(blocked), LONGEST_CONNECTION
+    )
+    lines = network.noded(
+        network.noded([*lines, *roads, *(network.Line(connection.points) for connection in connections)])
+    )
     index, slots, widened = _slots(spaces, rows)
     mouths = slots.mouths()
-    main = [lines[k] for k in largest_part(lines)[0]]
-    lines = without_stubs(main, lambda some: int(_is_served(slots, some).sum()))
+    main = [lines[k] for k in network.largest_part(lines)[0]]
+    lines = network.without_stubs(main, lambda some: int(_is_served(slots, some).sum()))
     wanted = {
         a: int(sum(len(rows[r].row) for r in aisle.rows)) for a, aisle in enumerate(aisles) if aisle.one_way
     }
-    lines, two_way = directed(lines, wanted)
+    lines, two_way = network.directed(lines, wanted)
 
     entry = None
     if entries is None or not len(entries):
-        on_street = entries_from_streets(lines, mouths)
+        on_street = network.entries_from_streets(lines, mouths)
         if on_street is not None:
             lines, entries, entry = on_street
         else:
-            entry = guess_entry(lines, mouths, blocked)
-            lines = noded([*lines, Line(entry.points)])
+            entry = network.guess_entry(lines, mouths, blocked)
+            lines = network.noded([*lines, network.Line(entry.points)])
             entries = entry.points[1:]
     served, clear = _is_served(slots, lines), np.ones(len(slots), dtype=bool)
     ways = shapely.STRtree([shapely.LineString(line.points) for line in lines])
@@ -114,13 +102,13 @@ def infer_lot(
     left_out["spaces that no aisle passes in front"] = index[~served].tolist()
     left_out["spaces beside which the only way is too narrow"] = index[served & ~clear].tolist()
     served &= clear
-    way = entries[0] - (corner_near(entries[0], lines) if entry is None else entry.points[0])
+    way = entries[0] - (network.corner_near(entries[0], lines) if entry is None else entry.points[0])
     return InferredLot(
         index=index[served],
         slots=slots[served],
-        lanes=tuple(limit_junctions([Lane(line.points, line.one_way) for line in lines])),
+        lanes=tuple(network.limit_junctions([Lane(line.points, line.one_way) for line in lines])),
         entries=entries,
-        goal=(entries[0] + BEYOND_ENTRY * (way / np.hypot(*way)))[None],
+        goal=(entries[0] + network.BEYOND_ENTRY * (way / np.hypot(*way)))[None],
         rows=tuple(rows),
         aisles=tuple(aisles),
         connections=tuple(connections),
@@ -148,7 +136,7 @@ def _large_enough(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[list[OpenRow
     return kept, small
 
 
-def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
+def _is_served(slots: Slots, lines: Sequence[network.Line]) -> BoolArray:
     """Whether the lane nearest to each slot's mouth, (n,), is before it and within reach."""
     mouth = slots.mouths()
     to_lane = nearest_on_lanes([Lane(line.points) for line in lines], mouth)[0] - mouth
@@ -158,25 +146,21 @@ def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
 
 
 def _slots(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[IntArray, Slots, int]:
-    parts, members, widened = [], [], 0
-    for part in rows:
-        row, index, outward = part.row, part.row.members, part.row.outward(part.side)
-        wider = np.maximum(KERB_WIDTH - spaces.width[index], 0.0) * row.kerbside
-        # The lane is on the left of a car that keeps to the right.
-        heading = np.stack([outward[:, 1], -outward[:, 0]], axis=1) if row.kerbside else -outward
-        parts.append(
-            Slots(
-                xy=spaces.xy[index] + wider[:, None] / 2 * outward,
-                yaw=np.arctan2(heading[:, 1], heading[:, 0]),
-                length=spaces.length[index],
-                width=spaces.width[index] + wider,
-                mouth=np.full(len(index), Mouth.LEFT if row.kerbside else Mouth.REAR, dtype=np.int8),
-            )
-        )
-        members.append(index)
-        widened += int((wider > 0.0).sum())
-    order = np.argsort(np.concatenate(members), kind="stable")
-    return np.concatenate(members)[order], Slots.joined(parts)[order], widened
+    index = np.concatenate([part.row.members for part in rows])
+    kerbside = np.repeat([part.row.kerbside for part in rows], [len(part.row) for part in rows])
+    outward = np.concatenate([part.row.outward(part.side) for part in rows])
+    wider = np.maximum(KERB_WIDTH - spaces.width[index], 0.0) * kerbside
+    # The lane is on the left of a car that keeps to the right.
+    heading = np.where(kerbside[:, None], np.stack([outward[:, 1], -outward[:, 0]], axis=1), -outward)
+    slots = Slots(
+        xy=spaces.xy[index] + wider[:, None] / 2 * outward,
+        yaw=np.arctan2(heading[:, 1], heading[:, 0]),
+        length=spaces.length[index],
+        width=spaces.width[index] + wider,
+        mouth=np.where(kerbside, Mouth.LEFT, Mouth.REAR).astype(np.int8),
+    )
+    order = np.argsort(index, kind="stable")
+    return index[order], slots[order], int((wider > 0.0).sum())
 
 
 MOST_LOST = 0.2  # largest fraction of the spaces that an import may leave out because no aisle reaches them

@@ -10,7 +10,6 @@ from itertools import product
 import networkx as nx
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
@@ -330,7 +329,7 @@ def _best_way_out(
 
 
 def _ways_out(
-    name: int, xy: FloatArray, lines: Sequence[Line], label: NDArray[np.int64], graph: nx.Graph
+    name: int, xy: FloatArray, lines: Sequence[Line], label: IntArray, graph: nx.Graph
 ) -> list[tuple[FloatArray, bool]]:
     """Return directions, (2,) unit vectors, in which a road may leave a node, and whether it continues a dead end."""
     arms = []
@@ -374,39 +373,30 @@ def connect(lines: Sequence[FloatArray], space: FreeSpace, longest: float) -> li
     stations, xy, owner = _samples(lines)
     cells = space.cells(xy)
     distance, before, source, pairs = space.spread(np.unique(cells))
-    at_cell: dict[int, int] = {}
-    # Ends of lines come first.
+    # Of the points in a cell the first counts, of all those the end of a line.
     is_end = np.r_[True, owner[1:] != owner[:-1]] | np.r_[owner[1:] != owner[:-1], True]
-    for i in np.lexsort((stations, owner, ~is_end)).tolist():
-        at_cell.setdefault(int(cells[i]), i)
+    order = np.lexsort((stations, owner, ~is_end))
+    order = order[np.unique(cells[order], return_index=True)[1]]
+    at_cell = np.zeros(len(distance), np.int64)
+    at_cell[cells[order]] = order
     graph = _road_graph(lines, stations, xy, owner)
-    length = [shapely.LineString(line).length for line in lines]
+    length = np.array([shapely.LineString(line).length for line in lines])[owner]
+    late = np.where(stations >= length - NEAR_END, 1, 2)
+    kind = np.where(stations <= np.minimum(NEAR_END, length / 2), 0, late)
 
-    def kind(i: int) -> int:
-        line, station = int(owner[i]), stations[i]
-        if station <= min(NEAR_END, length[line] / 2):
-            return 0
-        return 1 if station >= length[line] - NEAR_END else 2
-
-    best: dict[tuple[int, int, int, int], tuple[float, int, int]] = {}
-    one, other = source[pairs[:, 0]], source[pairs[:, 1]]
     gap = np.hypot(*(space.centers(pairs[:, 0]) - space.centers(pairs[:, 1])).T)
     cost = distance[pairs[:, 0]] + distance[pairs[:, 1]] + gap
-    for c, p, q, a, b in zip(
-        cost.tolist(), pairs[:, 0].tolist(), pairs[:, 1].tolist(), one.tolist(), other.tolist(), strict=True
-    ):
-        i, j = at_cell[a], at_cell[b]
-        if owner[i] == owner[j] and abs(stations[i] - stations[j]) < 20.0:
-            continue
-        if owner[i] > owner[j]:
-            i, j, p, q = j, i, q, p
-        key = (int(owner[i]), kind(i), int(owner[j]), kind(j))
-        if c < best.get(key, (np.inf,))[0]:
-            best[key] = (c, p, q)
+    turned = np.diff(owner[at_cell[source[pairs]]], axis=1) < 0
+    pairs = np.where(turned, pairs[:, ::-1], pairs)
+    one, other = at_cell[source[pairs]].T
+    far = np.flatnonzero((owner[one] != owner[other]) | (np.abs(stations[one] - stations[other]) >= 20.0))
+    far = far[np.lexsort((far, cost[far]))]
+    keys = np.stack([owner[one], kind[one], owner[other], kind[other]])[:, far]
+    best = far[np.unique(keys, axis=1, return_index=True)[1]]
+    best = best[np.lexsort((pairs[best, 1], pairs[best, 0], cost[best]))]
 
     found: list[Connection] = []
-    for c, p, q in sorted(best.values()):
-        i, j = (at_cell[int(source[cell])] for cell in (p, q))
+    for c, i, j, (p, q) in zip(*(a[best].tolist() for a in (cost, one, other, pairs)), strict=True):
         if c > longest:
             break
         try:
@@ -418,7 +408,7 @@ def connect(lines: Sequence[FloatArray], space: FreeSpace, longest: float) -> li
         path = np.concatenate([_trace(space, before, p)[::-1], _trace(space, before, q)])
         path = np.concatenate([[xy[i]], path[1:-1], [xy[j]]])
         room = float(space.clearance.ravel()[space.cells(path)].min())
-        detour = DETOUR_ENDS if kind(i) < 2 and kind(j) < 2 else DETOUR_MIDWAY
+        detour = DETOUR_ENDS if max(kind[i], kind[j]) < 2 else DETOUR_MIDWAY
         if known <= (DETOUR_WIDE if room >= WIDE else detour) * max(c, SHORTEST):
             continue
         points = space.pulled_straight(path)
@@ -509,16 +499,14 @@ class FreeSpace:
         passable = flat >= LEAST_CLEARANCE - 0.35 * self.cell
         passable[start] = True
         number = np.arange(flat.size).reshape(self.shape)
-        tails, heads, costs = [], [], []
-        for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        links, ways = [], ((1, 0), (0, 1), (1, 1), (1, -1))
+        for dx, dy in ways:
             a = number[: self.shape[0] - dx, max(0, -dy) : self.shape[1] - max(0, dy)].ravel()
             b = number[dx:, max(0, dy) : self.shape[1] - max(0, -dy)].ravel()
-            both = passable[a] & passable[b]
-            a, b = a[both], b[both]
-            tails.append(a)
-            heads.append(b)
-            costs.append((price[a] + price[b]) / 2 * float(np.hypot(dx, dy)) * self.cell)
-        tail, head, cost = map(np.concatenate, (tails, heads, costs))
+            links.append(np.stack([a, b])[:, passable[a] & passable[b]])
+        tail, head = np.concatenate(links, axis=1)
+        step = np.repeat([np.hypot(*way) for way in ways], [link.shape[1] for link in links])
+        cost = (price[tail] + price[head]) / 2 * step * self.cell
         graph = coo_array((cost, (tail, head)), shape=(flat.size,) * 2).tocsr()
         distance, before, source = dijkstra(
             graph, directed=False, indices=start, min_only=True, return_predecessors=True
@@ -526,10 +514,6 @@ class FreeSpace:
         apart = (source[tail] != source[head]) & np.isfinite(distance[tail]) & np.isfinite(distance[head])
         pairs = np.stack([tail[apart], head[apart]], axis=1).astype(np.int64)
         return np.asarray(distance), before.astype(np.int64), source.astype(np.int64), pairs
-
-    def is_clear(self, points: FloatArray, clearance: float) -> bool:
-        line = shapely.LineString(points)
-        return len(self._boundary.query(line, predicate="dwithin", distance=clearance)) == 0
 
     def room(self, points: FloatArray) -> float:
         return float(shapely.distance(shapely.LineString(points), self._whole))
@@ -543,7 +527,8 @@ class FreeSpace:
             while ahead > at + 1:
                 room = wide[at : ahead + 1].min() - 0.6 * self.cell
                 least = float(np.clip(room, LEAST_CLEARANCE - 0.1, COMFORTABLE - 0.3))
-                if self.is_clear(path[[at, ahead]], least):
+                way = shapely.LineString(path[[at, ahead]])
+                if not len(self._boundary.query(way, predicate="dwithin", distance=least)):
                     break
                 ahead -= max(1, (ahead - at) // 12)
             kept.append(max(ahead, at + 1))

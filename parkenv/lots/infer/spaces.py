@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError, require
 from parkenv.lots.generators import BAY_SIZE, KERB_SIZE
 from parkenv.world.drive_graph import component_labels
@@ -225,7 +225,7 @@ def find_rows(spaces: Spaces) -> list[Row]:
     return rows + [_chain(spaces, np.array([i]), kerbside=False) for i in single.tolist()]
 
 
-def _mutual(one: IntArray, other: IntArray, positive: NDArray[np.bool_], cost: FloatArray) -> IntArray:
+def _mutual(one: IntArray, other: IntArray, positive: BoolArray, cost: FloatArray) -> IntArray:
     """Return pairs, (m, 2), of spaces that are each other's nearest neighbour on that side."""
     if not len(one):
         return np.empty((0, 2), dtype=np.int64)
@@ -237,7 +237,7 @@ def _mutual(one: IntArray, other: IntArray, positive: NDArray[np.bool_], cost: F
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _chains(links: IntArray, n: int, used: NDArray[np.bool_]) -> list[IntArray]:
+def _chains(links: IntArray, n: int, used: BoolArray) -> list[IntArray]:
     """Return the spaces of each chain of links in order; a closed chain is cut at its first space."""
     label = component_labels(links, n)
     near: dict[int, list[int]] = {}
@@ -265,12 +265,15 @@ def _chain(spaces: Spaces, order: IntArray, *, kerbside: bool) -> Row:
         along = axis if kerbside else across
     else:
         step = np.gradient(xy, axis=0)
-        axis = axis * _one_way(axis)[:, None]
+        # Every axis points the way of its predecessor.
+        turns = np.sign((axis[1:] * axis[:-1]).sum(axis=1))
+        axis = axis * np.cumprod(np.r_[1.0, np.where(turns == 0.0, 1.0, turns)])[:, None]
         if kerbside:
             along = axis * np.sign((axis * step).sum(axis=1))[:, None]
         else:
             # One angle between row and cars for the whole row, so that a step in it does not turn its front.
-            turn = np.angle(np.exp(1j * (_bearing(step) - _bearing(axis))).sum())
+            bearings = (np.arctan2(vectors[:, 1], vectors[:, 0]) for vectors in (step, axis))
+            turn = np.angle(np.exp(1j * np.subtract(*bearings)).sum())
             turn = np.round(turn / RIGHT) * RIGHT if abs(abs(turn) - np.pi / 2) < SQUARE else turn
             cos, sin = np.cos(turn), np.sin(turn)
             along = np.asarray(axis @ np.array([[cos, sin], [-sin, cos]]))
@@ -289,16 +292,6 @@ def _chain(spaces: Spaces, order: IntArray, *, kerbside: bool) -> Row:
         half=(width if kerbside else length) / 2,
         pitch=length if kerbside else width / slope,
     )
-
-
-def _one_way(vectors: FloatArray) -> FloatArray:
-    """Signs, (k,), that make every vector point the way of its predecessor."""
-    turns = np.sign((vectors[1:] * vectors[:-1]).sum(axis=1))
-    return np.asarray(np.cumprod(np.r_[1.0, np.where(turns == 0.0, 1.0, turns)]), dtype=np.float64)
-
-
-def _bearing(vectors: FloatArray) -> FloatArray:
-    return np.asarray(np.arctan2(vectors[:, 1], vectors[:, 0]))
 
 
 SPACING = (1.8, 8.0)  # least and greatest distance, m, from a space to the next in its row

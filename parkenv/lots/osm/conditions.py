@@ -13,7 +13,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import BoolArray
 from parkenv.errors import with_extra
-from parkenv.lots.osm.roads import NOT_CARS, closed_to_cars, decisive_access
+from parkenv.lots.osm.roads import NOT_CARS, Side, closed_to_cars, decisive_access
 from parkenv.lots.unread import note_unread
 from parkenv.world.tariff import DAYS, PUBLIC, Hours
 from parkenv.world.week import DAY_S, HOUR_S
@@ -114,6 +114,14 @@ def week_of(text: str) -> Week | None:
     return Week(weeks[0], doubt)
 
 
+def hours_in(tags: Tags, key: str, text: str, assumed: str, otherwise: BoolArray) -> BoolArray:
+    """Return the hours that a text says, or others; what is not read, or doubtful, is listed with what is assumed."""
+    week = week_of(text)
+    if week is None or week.doubt:
+        note_unread(tags, key, assumed if week is None else week.doubt)
+    return otherwise if week is None else week.minutes
+
+
 def _open_past_midnight(minutes: BoolArray, alone: BoolArray, rule: str) -> None:
     """Open a week after midnight for as long as a rule, `alone`, lasts that was in force before."""
     for h0, m0, h1, m1 in re.findall(r"(\d?\d):(\d\d)\s*-\s*(\d?\d):(\d\d)", rule):
@@ -192,10 +200,7 @@ def conditional(tags: Tags, key: str, base: str = "") -> tuple[Conditional, list
                     continue
                 holds = _holds(factor.strip())
                 if holds is None:
-                    week = week_of(factor)
-                    if week is None or week.doubt:
-                        note_unread(tags, name, "the condition is never met" if week is None else week.doubt)
-                    holds = ~always() if week is None else week.minutes
+                    holds = hours_in(tags, name, factor, "the condition is never met", ~always())
                 minutes = minutes & holds
             if below < 0.0 and minutes.any() and to.strip().lower() not in FREE:
                 # What longer stays alone pay is free before.
@@ -321,12 +326,52 @@ def access_layer(tags: Tags, prefix: str = "") -> Conditional:
     return note_users(tags, key, conditional(tags, key)[0])
 
 
+def kerb_tag(tags: Tags, key: str, side: Side) -> str:
+    """Return the key of one side of a way, `{}` in the text, that the tags have; else that of both."""
+    return next((k for k in (key.format(side), key.format("both")) if k in tags), key.format("both"))
+
+
+def kerb_conditions(tags: Tags, side: Side) -> Conditional:
+    """Return the values of `parking:condition`, those of other hours, and a `parking:lane` that forbids parking."""
+    key, lane = (kerb_tag(tags, f"parking:{what}:{{}}", side) for what in ("condition", "lane"))
+    forbidden = tags.get(lane, "") if users_of(tags.get(lane, "")) == FORBIDDEN else ""
+    both_is_own = "parking:condition:both" in tags and key in tags
+    parts = []
+    for own in ("{}", "{}:2", "2:{}", "{}:3", "3:{}"):
+        at = kerb_tag(tags, f"parking:condition:{own}", side)
+        interval_key, vehicles_key = (
+            f"{at}:{what}" if both_is_own else kerb_tag(tags, f"parking:condition:{own}:{what}", side)
+            for what in ("time_interval", "vehicles")
+        )
+        value, interval = tags.get(at) or "", tags.get(interval_key, "")
+        if own == "{}" and interval and not value:
+            value, forbidden = forbidden or "free", ""
+        # What is for some vehicles alone is for no ordinary car; what binds these alone does not concern it.
+        vehicles = tags.get(vehicles_key, "")
+        if vehicles and users_of(vehicles) != PUBLIC:
+            value = "" if users_of(value) == FORBIDDEN else RESERVED.get(vehicles, "no")
+        if value:
+            note_users(tags, at, (value, ()))
+            when = hours_in(tags, interval_key, interval, "at all times", always()) if interval else always()
+            parts.append((value, when))
+    default = f"{key}:default" if both_is_own else kerb_tag(tags, "parking:condition:{}:default", side)
+    return forbidden or tags.get(default, ""), [*parts, *conditional(tags, key)[0][1]]
+
+
+def kerb_users(tags: Tags, side: Side) -> tuple[str, BoolArray]:
+    """Return the class of users of one side of a way, and when they may park there."""
+    restriction = kerb_tag(tags, "parking:{}:restriction", side)
+    conditional_restriction = kerb_tag(tags, "parking:{}:restriction:conditional", side)
+    if conditional_restriction.rpartition(":")[0] != restriction and restriction not in tags:
+        restriction = conditional_restriction.rpartition(":")[0]
+    layers = [note_users(tags, restriction, conditional(tags, restriction)[0]), kerb_conditions(tags, side)]
+    layers += [access_layer(tags, f"parking:{at}:") for at in (side, "both")]
+    return parking_users(layers, always())
+
+
 def opening(tags: Tags) -> BoolArray:
     text = tags.get("opening_hours", "").strip()
-    week = week_of(text) if text else None
-    if text and (week is None or week.doubt):
-        note_unread(tags, "opening_hours", "always open" if week is None else week.doubt)
-    return always() if week is None else week.minutes
+    return hours_in(tags, "opening_hours", text, "always open", always()) if text else always()
 
 
 _UNITS = (

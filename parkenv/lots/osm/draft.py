@@ -42,12 +42,12 @@ from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.parking import (
     ARRANGEMENTS,
     BUILDING_REACH,
-    CORRIDOR,
     ENTRANCE_REACH,
     Area,
     CrossedOutlineError,
     Junctions,
     areas_of,
+    corridor_of,
     exterior_rings,
     fill_outline,
     find_goals,
@@ -286,13 +286,7 @@ class _LotImport(MapImport):
         if not any(road.has_kerb_parking for road in self.roads):
             return
         junctions = Junctions(self.roads, self.crossings())
-        corridors = shapely.union_all(
-            [
-                shapely.LineString(road.points).buffer(CORRIDOR * road.half_width, cap_style="flat")
-                for road in self.roads
-            ]
-        )
-        shapely.prepare(corridors)
+        corridors = corridor_of(self.roads)
         for k, road in enumerate(self.roads):
             for side in SIDES:
                 tagged = road.side_of_way(side)
@@ -532,18 +526,12 @@ def _refuse_swapped(areas: Sequence[Area]) -> None:
 def _plausibility(outlines: Sequence[FloatArray]) -> tuple[float, float]:
     """Return the fraction of outlines, (k, 2) degrees, of a car's size, and their median skew: 0 for rectangles."""
     frame = LocalFrame.around(np.concatenate(outlines))
-    fits, skew = [], []
-    for outline in outlines:
-        polygon = shapely.Polygon(frame.to_xy(outline))
-        if shapely.area(polygon) < 0.1:
-            continue
-        one, other = np.diff(rectangle_corners(polygon)[:3], axis=0)
-        width, length = sorted((float(np.hypot(*one)), float(np.hypot(*other))))
-        fits.append(1.8 < width < 3.3 and 4.0 < length < 6.4 and width * length < LARGEST_USUAL)
-        corners = shapely.get_coordinates(shapely.simplify(polygon, 0.2))
-        if len(corners) == 5:
-            one, other = np.diff(corners[:3], axis=0)
-            skew.append(abs(float(one @ other)) / float(np.hypot(*one) * np.hypot(*other)))
+    polygons = [p for o in outlines if (p := shapely.Polygon(frame.to_xy(o))).area >= 0.1]
+    sizes = [np.hypot(*np.diff(rectangle_corners(p)[:3], axis=0).T) for p in polygons]
+    fits = [1.8 < s.min() < 3.3 and 4.0 < s.max() < 6.4 and s.prod() < LARGEST_USUAL for s in sizes]
+    simple = [shapely.get_coordinates(shapely.simplify(p, 0.2)) for p in polygons]
+    sides = [np.diff(corners[:3], axis=0) for corners in simple if len(corners) == 5]
+    skew = [abs(float(a @ b)) / float(np.hypot(*a) * np.hypot(*b)) for a, b in sides]
     return float(np.mean(fits)) if fits else 0.0, float(np.median(skew)) if skew else 0.0
 
 
@@ -591,8 +579,7 @@ def split_town(
     shapes = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in spaces], dtype=object)
     near = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=SAME_CAR_PARK)
     label = component_labels(near.T, len(spaces))
-    size = np.bincount(label)
-    first = np.array([int(np.flatnonzero(label == k)[0]) for k in range(len(size))])
+    _, first, size = np.unique(label, return_index=True, return_counts=True)
     chosen = [k for k in np.lexsort((first, -size)).tolist() if size[k] >= least]
     require(
         chosen, f"{len(spaces)} parking spaces in groups of at most {size.max()}, want a group of {least}"

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple, Self
+from xml.etree import ElementTree
 
 import numpy as np
 import shapely
@@ -28,10 +29,9 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, require, with_extra
 from parkenv.files.file_names import is_plain
-from parkenv.files.limited_reading import read_json, require_file, unpacked_path
+from parkenv.files.limited_reading import open_limited, read_json, require_file, unpacked_path
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.formats.geojson import Positions
-from parkenv.lots.osm.answers import elements_of_xml, has_geometry, refuse_partial
 from parkenv.lots.osm.export_tags import NESTED, OSM_ID, id_of_feature, tags_of_feature
 
 # Keys that distinguish elements of OpenStreetMap from other GeoJSON.
@@ -40,11 +40,13 @@ MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
 KEYS = (*MAPPED_KEYS, "noexit", "shop", "office", "craft", "healthcare", "tourism", "leisure")
 # Keys of the nodes that an import reads.
 NODE_KEYS = (*KEYS, "barrier", "motorcar", "motor_vehicle", "vehicle")
+MOST_XML_BYTES = 4_000_000_000  # maximum size of unpacked XML
 # Maximum number of nodes, ways and relations of one file: a city of a million people.
 MOST_ELEMENTS = 5_000_000
 CAR_KEYS = frozenset(("motorcar", "motor_vehicle", "vehicle"))
 # Keys of a restriction of turns that holds for cars, the most specific first.
 TURN_KEYS = (*(f"restriction:{key}" for key in ("motorcar", "motor_vehicle", "vehicle")), "restriction")
+_FAILED = re.compile(r"error|timed out|out of memory|limit|abort", re.IGNORECASE)
 _APART = 3e-8  # degrees, some 3 mm: nodes at this distance are not the same
 _SAME = 1e-6  # degrees, some 0.1 m: a cut nearer to a node is at the node
 BEYOND = (np.nan, np.nan)  # position of a node that is not in the file
@@ -129,7 +131,7 @@ def read_map(path: Path) -> OsmMap:
     content = read_json(path)
     with naming(path):
         if isinstance(content, dict) and isinstance(content.get("elements"), list):
-            refuse_partial(content.get("remark"))
+            _refuse_partial(content.get("remark"))
             return _map_of_overpass(content["elements"])
         if not isinstance(content, dict) or not isinstance(content.get("features"), list):
             raise InputError("no features, want a GeoJSON FeatureCollection, or a map as .osm or .osm.pbf")
@@ -374,10 +376,9 @@ def _is_ring(line: FloatArray) -> bool:
 
 
 def _runs(line: FloatArray) -> list[FloatArray]:
-    inside = ~np.isnan(line[:, 0])
-    starts = np.flatnonzero(np.diff(np.r_[False, inside].astype(np.int8)) == 1)
-    ends = np.flatnonzero(np.diff(np.r_[inside, False].astype(np.int8)) == -1) + 1
-    return [line[i:j] for i, j in zip(starts, ends, strict=True) if j - i > 1]
+    beyond = np.isnan(line[:, 0])
+    parts = np.split(line, np.flatnonzero(np.diff(beyond)) + 1)
+    return [part for part in parts if len(part) > 1 and not np.isnan(part[0, 0])]
 
 
 def _joined(lines: Sequence[FloatArray]) -> list[FloatArray]:
@@ -419,8 +420,8 @@ def _read_osm(path: Path) -> OsmMap:
     source = osmium.io.File(str(path), "pbf" if path.suffix.lower() == ".pbf" else f"osm{packed}")
     raw, count = _RawElements(), 0
     with naming(path):
-        if path.suffix.lower() != ".pbf" and has_geometry(path):
-            return _map_of_overpass(elements_of_xml(path))
+        if path.suffix.lower() != ".pbf" and _has_geometry(path):
+            return _map_of_overpass(_elements_of_xml(path))
         try:
             for kind, add in (
                 (osmium.osm.RELATION, raw.add_relation),
@@ -604,6 +605,50 @@ def _map_of_overpass(elements: list[Any]) -> OsmMap:
                 if m["type"] == "node" and "lat" in m and m["ref"] in raw.needed_nodes:
                     raw.positions.setdefault(m["ref"], _position(name, m["lat"], m["lon"]))
     return raw.map()
+
+
+def _elements_of_xml(path: Path) -> list[Any]:
+    elements: list[Any] = []
+    with open_limited(path) as file, naming(path):
+        try:
+            for _, node in ElementTree.iterparse(file):
+                if node.tag in ("node", "way", "relation"):
+                    elements.append(_answer_of_xml(node))
+                    node.clear()
+        except (ElementTree.ParseError, ValueError) as error:
+            raise InputError(f"not an OpenStreetMap file: {error}") from error
+    return elements
+
+
+def _answer_of_xml(node: ElementTree.Element) -> dict[str, Any]:
+    answer: dict[str, Any] = {"type": node.tag, "tags": {t.get("k"): t.get("v") for t in node.iter("tag")}}
+    for name, value in node.attrib.items():
+        answer[name] = int(value) if name in ("id", "ref", "version") else value
+    points = node.findall("nd")
+    answer["geometry"] = [dict(nd.attrib) if nd.get("lat") else None for nd in points]
+    if points and all(nd.get("ref") for nd in points):
+        answer["nodes"] = [int(nd.get("ref", 0)) for nd in points]
+    answer["members"] = [{**_answer_of_xml(m), "type": m.get("type")} for m in node.findall("member")]
+    return answer
+
+
+def _has_geometry(path: Path) -> bool:
+    """Whether an XML file has positions of ways in place; one whose remark says that it is partial is refused."""
+    found = False
+    with open_limited(path, MOST_XML_BYTES) as file:
+        for line in file:
+            found |= b"<nd" in line and b"lat=" in line
+            if b"<remark" in line:
+                _refuse_partial(line.decode(errors="replace").partition("<remark")[2].strip("<>/ \n"))
+    return found
+
+
+def _refuse_partial(remark: object) -> None:
+    if isinstance(remark, str) and _FAILED.search(remark):
+        raise InputError(
+            f"its remark says {remark.strip()!a:.160}: the answer is partial, want a whole one; ask for a "
+            "smaller area, or with a longer [timeout:] and a larger [maxsize:]"
+        )
 
 
 def _feature_element(

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.lots.generators import (
     BAY_SIZE,
@@ -25,18 +25,7 @@ from parkenv.lots.generators import (
     slots_from_polygons,
 )
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.conditions import (
-    FORBIDDEN,
-    RESERVED,
-    Conditional,
-    access_layer,
-    always,
-    conditional,
-    note_users,
-    parking_users,
-    users_of,
-    week_of,
-)
+from parkenv.lots.osm.conditions import FORBIDDEN, kerb_tag, kerb_users, users_of
 from parkenv.lots.osm.elements import OsmElement
 from parkenv.lots.osm.roads import (
     SIDES,
@@ -129,7 +118,7 @@ def bend_factor(points: FloatArray, start: float, end: float, side: Side, reach:
     return max(1.0, (end - start) * (n - 1) / n / max(float(np.hypot(beside[:, 0], beside[:, 1]).sum()), 0.1))
 
 
-def without_overlaps(boxes: NDArray[np.object_]) -> NDArray[np.bool_]:
+def without_overlaps(boxes: NDArray[np.object_]) -> BoolArray:
     """Return the mask, (n,), of rectangles to keep so that none overlap; earlier ones take precedence."""
     kept = np.ones(len(boxes), dtype=bool)
     if len(boxes) < 2:
@@ -164,51 +153,6 @@ class Kerb:
     on_carriageway: bool  # whether parked cars are within `width`
 
 
-def kerb_tag(tags: Mapping[str, str], key: str, side: Side) -> str:
-    """Return the key of one side of a way, `{}` in the text, that the tags have; else that of both."""
-    return next((k for k in (key.format(side), key.format("both")) if k in tags), key.format("both"))
-
-
-def kerb_conditions(tags: Mapping[str, str], side: Side) -> Conditional:
-    """Return the values of `parking:condition`, those of other hours, and a `parking:lane` that forbids parking."""
-    key, lane = (kerb_tag(tags, f"parking:{what}:{{}}", side) for what in ("condition", "lane"))
-    forbidden = tags.get(lane, "") if users_of(tags.get(lane, "")) == FORBIDDEN else ""
-    both_is_own = "parking:condition:both" in tags and key in tags
-    parts = []
-    for own in ("{}", "{}:2", "2:{}", "{}:3", "3:{}"):
-        at = kerb_tag(tags, f"parking:condition:{own}", side)
-        interval_key, vehicles_key = (
-            f"{at}:{what}" if both_is_own else kerb_tag(tags, f"parking:condition:{own}:{what}", side)
-            for what in ("time_interval", "vehicles")
-        )
-        value, interval = tags.get(at) or "", tags.get(interval_key, "")
-        if own == "{}" and interval and not value:
-            value, forbidden = forbidden or "free", ""
-        # What is for some vehicles alone is for no ordinary car; what binds these alone does not concern it.
-        vehicles = tags.get(vehicles_key, "")
-        if vehicles and users_of(vehicles) != PUBLIC:
-            value = "" if users_of(value) == FORBIDDEN else RESERVED.get(vehicles, "no")
-        week = week_of(interval) if interval and value else None
-        if interval and value and (week is None or week.doubt):
-            note_unread(tags, interval_key, "at all times" if week is None else week.doubt)
-        if value:
-            note_users(tags, at, (value, ()))
-            parts.append((value, always() if week is None else week.minutes))
-    default = f"{key}:default" if both_is_own else kerb_tag(tags, "parking:condition:{}:default", side)
-    return forbidden or tags.get(default, ""), [*parts, *conditional(tags, key)[0][1]]
-
-
-def kerb_users(tags: Mapping[str, str], side: Side) -> tuple[str, BoolArray]:
-    """Return the class of users of one side of a way, and when they may park there."""
-    restriction = kerb_tag(tags, "parking:{}:restriction", side)
-    conditional_restriction = kerb_tag(tags, "parking:{}:restriction:conditional", side)
-    if conditional_restriction.rpartition(":")[0] != restriction and restriction not in tags:
-        restriction = conditional_restriction.rpartition(":")[0]
-    layers = [note_users(tags, restriction, conditional(tags, restriction)[0]), kerb_conditions(tags, side)]
-    layers += [access_layer(tags, f"parking:{at}:") for at in (side, "both")]
-    return parking_users(layers, always())
-
-
 def kerb_of(tags: Mapping[str, str], side: Side, *, reserved: bool = False) -> Kerb | str | None:
     """Return the parking on one side of a way; a reason if tagged but unusable; None without tags.
 
@@ -237,18 +181,10 @@ def kerb_of(tags: Mapping[str, str], side: Side, *, reserved: bool = False) -> K
             f"{name.strip()}{value}" for name, value in reasons if users_of(value) not in (PUBLIC, None)
         )
         return f"kerbs with {next(closed, 'rules that forbid parking')}"
-    counted_keys = (
-        ("parking:{}:capacity",) if kind is not None else ("parking:lane:{}:capacity", "parking:{}:capacity")
-    )
-    counts = (
-        count_in(tags, kerb_tag(tags, text, side), "by the length of the kerb") for text in counted_keys
-    )
+    counted = ("parking:{}:capacity",) if kind else ("parking:lane:{}:capacity", "parking:{}:capacity")
+    counts = (count_in(tags, kerb_tag(tags, text, side), "by the length of the kerb") for text in counted)
     capacity = next((count for count in counts if count is not None), None)
-    where = (
-        kind
-        if kind is not None
-        else tags.get(kerb_tag(tags, f"parking:lane:{{}}:{old}", side)) or "on_street"
-    )
+    where = kind or tags.get(kerb_tag(tags, f"parking:lane:{{}}:{old}", side)) or "on_street"
     return Kerb(orientation, capacity, where in ("lane", "on_street"))
 
 
@@ -296,9 +232,7 @@ def free_intervals(total: float, closed: Sequence[tuple[float, float]]) -> list[
     return free
 
 
-def _distribute(
-    capacity: int, free: Sequence[tuple[float, float]], fit: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _distribute(capacity: int, free: Sequence[tuple[float, float]], fit: IntArray) -> IntArray:
     count = np.zeros(len(fit), dtype=np.int64)
     length = np.array([end - start for start, end in free])
     for _ in range(min(capacity, int(fit.sum()))):
@@ -360,6 +294,14 @@ PHASES = (0.0, 0.25, 0.5, 0.75)
 CORRIDOR = 0.8  # fraction of a road's half width that must be clear of slots of other roads
 
 
+def corridor_of(roads: Sequence[Road], blocked: Sequence[shapely.Geometry] = ()) -> shapely.Geometry:
+    """Return what of roads must be clear of slots, and what is blocked besides, prepared for many tests."""
+    ways = [(shapely.LineString(road.points), CORRIDOR * road.half_width) for road in roads]
+    taken = shapely.union_all([*(line.buffer(width, cap_style="flat") for line, width in ways), *blocked])
+    shapely.prepare(taken)
+    return taken
+
+
 def fill_outline(
     outline: shapely.Geometry,
     roads: Sequence[Road],
@@ -375,12 +317,7 @@ def fill_outline(
     if not roads:
         return NO_SLOTS
     lines = np.array([shapely.LineString(road.points) for road in roads])
-    corridors = [
-        line.buffer(CORRIDOR * road.half_width, cap_style="flat")
-        for line, road in zip(lines, roads, strict=True)
-    ]
-    taken = shapely.union_all([*corridors, *blocked])
-    shapely.prepare(taken)
+    taken = corridor_of(roads, blocked)
     roomy = shapely.buffer(outline, OUTLINE_TOLERANCE)
     shapely.prepare(roomy)
 

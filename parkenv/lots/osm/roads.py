@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
@@ -366,7 +365,7 @@ def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) 
     return xy
 
 
-def _road_nodes(roads: Sequence[Road]) -> list[NDArray[np.int64]]:
+def _road_nodes(roads: Sequence[Road]) -> list[IntArray]:
     """Return the node labels of the points of each road; roads meet where they share a label."""
     if not roads:
         return []

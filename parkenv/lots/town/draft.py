@@ -54,26 +54,8 @@ from parkenv.lots.osm.parking import (
     without_overlaps,
 )
 from parkenv.lots.osm.roads import Rank, Road, Turns, count_in, off_the_ground, turns_of
+from parkenv.lots.town import supply
 from parkenv.lots.town.streets import BEYOND, read_streets
-from parkenv.lots.town.supply import (
-    CLASS_RULE,
-    GARAGES,
-    PRICE,
-    STRIPS,
-    FacilityRow,
-    ListedCarPark,
-    Rules,
-    expected_capacity,
-    facilities_of,
-    kerb_sides,
-    levels_of,
-    matched,
-    read_listed,
-    rule_of,
-    rules_of,
-    strip_side,
-    table_of,
-)
 from parkenv.lots.unread import Unread, note_unread, noting_unread, unread_rows
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_REACH
@@ -86,7 +68,7 @@ OFF_STREET = ("driveway", "parking_aisle")  # values of `service` of roads witho
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in it do not differ
 # Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it.
-PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
+PAID: dict[str, Any] = {"per_hour": supply.PRICE, "assumed": True}
 NO_ENTRY = "no entry: no street crosses the edge of the map"
 TOO_FAR = f"parking farther than {FACILITY_REACH:g} m from every street"
 NO_GOAL = "no goal: no building and no point of interest in it; export buildings and shops, too"
@@ -106,7 +88,7 @@ class TownDraft:
     def caution(self) -> str:
         """What to know of the town where more than half of its spaces are at untagged kerbs; else empty."""
         total = sum(row["capacity"] for row in self.facilities)
-        guessed = sum(row["capacity"] for row in self.facilities if row["rule"] == CLASS_RULE)
+        guessed = sum(row["capacity"] for row in self.facilities if row["rule"] == supply.CLASS_RULE)
         if 2 * guessed <= total:
             return ""
         share = f"{100 * guessed / total:.0f} %"
@@ -137,7 +119,7 @@ def import_town(
     multiplies places.
     """
     path = Path(path)
-    listed = [] if car_parks is None else read_listed(Path(car_parks))
+    listed = [] if car_parks is None else supply.read_listed(Path(car_parks))
     register = None if bays is None else read_bays(bays, columns)
     with noting_unread() as unread, naming(path):
         place, name = read_map(path), place_name(path)
@@ -183,7 +165,7 @@ class _TownImport(MapImport):
         for e in elements:
             if is_parking_area(e) and not e.is_node and not e.is_closed:
                 self.left_out["parking without an outline"].append(e.id)
-        self.rows: list[FacilityRow] = []
+        self.rows: list[supply.FacilityRow] = []
         self.names: set[str] = set()
         self.used: set[int] = set()  # parking areas whose places are slots
         self.beside: FloatArray | None = None  # what is near these attracts, if not everything does
@@ -213,7 +195,7 @@ class _TownImport(MapImport):
         for area in self.areas(is_space, mended=True):
             tags, kind = area.element.tags, area.element.tags.get("parking_space", "normal")
             reason = off_the_ground(tags) or closed_parking(tags)
-            if kind not in CAR_SPACES and rules_of(tags).users == PUBLIC:
+            if kind not in CAR_SPACES and supply.rules_of(tags).users == PUBLIC:
                 reason = f"parking_space={kind}"
             if area.element.cut:
                 reason = "an outline that the edge of the map cuts"
@@ -232,21 +214,25 @@ class _TownImport(MapImport):
             tree = shapely.STRtree([a.polygon for a in self.parking])
             space, park = tree.query(shapely.point_on_surface(polygons), predicate="intersects")
             owner[space[::-1]] = park[::-1]
-        groups: dict[int, tuple[list[Slots], list[Rules]]] = defaultdict(lambda: ([], []))
+        groups: dict[int, tuple[list[Slots], list[supply.Rules]]] = defaultdict(lambda: ([], []))
         for _, index, slots in by_rank:
             for k in np.unique(owner[index]).tolist():
                 is_own = owner[index] == k
                 groups[k][0].append(slots[is_own])
-                groups[k][1].extend(rules_of(parts[i].area.element.tags) for i in index[is_own].tolist())
+                groups[k][1].extend(
+                    supply.rules_of(parts[i].area.element.tags) for i in index[is_own].tolist()
+                )
         self.used = {k for k in groups if k < len(self.parking)}
         for k, (drawn, rules) in sorted(groups.items()):
             around = self.parking[k] if k in self.used else parts[int(np.flatnonzero(owner == k)[0])].area
             inside = around.element
-            whole = rules_of(inside.tags) if k in self.used else Rules()
-            row = FacilityRow(self._named(inside.tags, inside.id), "lot", whole, "drawn", "", inside.id)
+            whole = supply.rules_of(inside.tags) if k in self.used else supply.Rules()
+            row = supply.FacilityRow(
+                self._named(inside.tags, inside.id), "lot", whole, "drawn", "", inside.id
+            )
             row.slots = Slots.joined(drawn)
             # A space without rules of its own has those of its car park.
-            row.slot_rules = [own if own != Rules() else whole for own in rules]
+            row.slot_rules = [own if own != supply.Rules() else whole for own in rules]
             row.tagged = count_in(inside.tags, "capacity", "the drawn places") if k in self.used else None
             more = (row.tagged or 0) - len(row.slots)
             if more > 0:
@@ -256,18 +242,19 @@ class _TownImport(MapImport):
             self.rows.append(row)
 
     def read_kerbs(self, untagged: float) -> None:
-        sides: list[FacilityRow] = []
-        for k, area in enumerate(self.parking):
-            if area.element.tags.get("parking") in STRIPS and k not in self.used:
-                side = strip_side(area, self.roads, self.tree)
-                if side is not None:
-                    self.used.add(k)
-                    sides.append(side)
-        sides += kerb_sides(self.roads, self.crossings(), self.buildings, self.left_out, untagged)
+        strips = {
+            k: area
+            for k, area in enumerate(self.parking)
+            if area.element.tags.get("parking") in supply.STRIPS
+        }
+        drawn = {k: supply.strip_side(strips[k], self.roads, self.tree) for k in strips if k not in self.used}
+        self.used |= {k for k, side in drawn.items() if side is not None}
+        sides = list(filter(None, drawn.values()))
+        sides += supply.kerb_sides(self.roads, self.crossings(), self.buildings, self.left_out, untagged)
         half_widths = [CORRIDOR * road.half_width for road in self.roads]
         corridors = shapely.buffer(self.lines, half_widths, cap_style="flat")
         # Several runs of one way are one kerb.
-        whole: dict[str, FacilityRow] = {}
+        whole: dict[str, supply.FacilityRow] = {}
         for side in sides:
             row = whole.setdefault(side.element, side)
             if row is side:
@@ -278,11 +265,10 @@ class _TownImport(MapImport):
         rows = list(whole.values())
         slots = Slots.joined([row.slots for row in rows] or [NO_SLOTS])
         of = np.repeat(np.arange(len(rows)), [len(row.slots) for row in rows])
-        blocked = np.zeros(len(slots), bool)
-        blocked[shapely.STRtree(corridors).query(slots.boxes(shrink=0.05), predicate="intersects")[0]] = True
-        drawn = Slots.joined([*(row.slots for row in self.rows), NO_SLOTS])
-        boxes = np.concatenate([drawn.boxes(MAPPED_OVERLAP), slots.boxes(RULE_OVERLAP)])
-        is_free = without_overlaps(boxes)[len(drawn) :] & ~blocked
+        on_street = shapely.STRtree(corridors).query(slots.boxes(shrink=0.05), predicate="intersects")[0]
+        others = Slots.joined([*(row.slots for row in self.rows), NO_SLOTS])
+        boxes = np.concatenate([others.boxes(MAPPED_OVERLAP), slots.boxes(RULE_OVERLAP)])
+        is_free = without_overlaps(boxes)[len(others) :] & ~np.isin(np.arange(len(slots)), on_street)
         lost = np.bincount(of[~is_free], minlength=len(rows))
         self.left_out["kerbs with fewer places, because of streets and other places"] += [
             rows[k].element for k in np.flatnonzero(lost).tolist()
@@ -310,11 +296,11 @@ class _TownImport(MapImport):
             raise InputError(f"no bay stands at a street of the map ({why}); {advice}")
         self.n_bays = len(kerbs.ids) + sum(len(left.ids) for left in self.bays_left_out)
         self.bays_found = register.found
-        rules: dict[tuple[Rule, ...], Rules] = {}
+        rules: dict[tuple[Rule, ...], supply.Rules] = {}
         for own, count in Counter(register.rules[kerbs.bay].tolist()).items():
             tags, notes = tags_of(own)
             with noting_unread() as unread:
-                rules[own] = rules_of(tags)
+                rules[own] = supply.rules_of(tags)
             for part, text, assumed in notes:
                 self.unread[part, text, assumed] += count
             for note in unread_rows(unread):
@@ -328,7 +314,9 @@ class _TownImport(MapImport):
             name = self._named({"name": f"{street} ({element})" if street else ""}, element)
             usual = Counter(own_rules).most_common(1)[0][0]
             slots, ids = kerbs.slots[np.array(index)], [kerbs.ids[i] for i in index]
-            row = FacilityRow(name, "kerb", usual, "register", "", element, None, slots, own_rules, ids)
+            row = supply.FacilityRow(
+                name, "kerb", usual, "register", "", element, None, slots, own_rules, ids
+            )
             self.rows.append(row)
 
     def read_counted(self) -> None:
@@ -350,9 +338,9 @@ class _TownImport(MapImport):
         ]
         for element, shape, area in (*outlines, *points):
             tags = element.tags
-            rule = rule_of(tags)
-            kind = "garage" if rule in GARAGES else "lot"
-            rules = rules_of(tags)
+            rule = supply.rule_of(tags)
+            kind = "garage" if rule in supply.GARAGES else "lot"
+            rules = supply.rules_of(tags)
             note_other_keys(tags)
             if rule == "boxes" and rules.users == PUBLIC:
                 rules = replace(rules, users="private")
@@ -362,8 +350,10 @@ class _TownImport(MapImport):
                 continue
             tagged = count_in(tags, "capacity", "by area and levels")
             source = ("tag", "") if tagged else ("rule", rule)
-            row = FacilityRow(self._named(tags, element.id), kind, rules, *source, element.id, tagged, xy=xy)
-            rest = tagged or expected_capacity(rule, area, levels_of(tags))
+            row = supply.FacilityRow(
+                self._named(tags, element.id), kind, rules, *source, element.id, tagged, xy=xy
+            )
+            rest = tagged or supply.expected_capacity(rule, area, supply.levels_of(tags))
             for users in RESERVED_PLACES:
                 key = f"capacity:{users}"
                 n = 0 if tags.get(key) == "no" else count_in(tags, key, "no reserved place") or 0
@@ -376,13 +366,13 @@ class _TownImport(MapImport):
                 row.counted.insert(0, (row.name, rest, rules))
             self.rows.append(row)
 
-    def use_list(self, listed: list[ListedCarPark]) -> None:
+    def use_list(self, listed: list[supply.ListedCarPark]) -> None:
         """Give the car parks of a list their names and capacities; those that the map lacks are garages of it."""
         of_map = [row for row in self.rows if row.kind != "kerb" and row.xy is not None]
         places = np.array([len(row.slots) + sum(n for _, n, _ in row.counted) for row in of_map], np.float64)
         at = self.frame.to_xy([(car_park.lon, car_park.lat) for car_park in listed])
         xy = np.array([row.xy for row in of_map]).reshape(-1, 2)
-        same = matched(listed, at, [row.name for row in of_map], places, xy)
+        same = supply.matched(listed, at, [row.name for row in of_map], places, xy)
         for car_park, point, k in zip(listed, at, same.tolist(), strict=True):
             if k < 0:
                 xy_of = self._entrance(shapely.Point(point), [])
@@ -391,7 +381,7 @@ class _TownImport(MapImport):
                         "car parks of the list that the map lacks, without a street or a capacity"
                     ].append(car_park.name)
                     continue
-                row = FacilityRow(car_park.name, "garage", Rules(), "list", "", "", xy=xy_of)
+                row = supply.FacilityRow(car_park.name, "garage", supply.Rules(), "list", "", "", xy=xy_of)
                 self.rows.append(row)
             else:
                 row = of_map[k]
@@ -448,7 +438,7 @@ class _TownImport(MapImport):
         index = np.flatnonzero(near)
         slots, ids = slots[index], [ids[i] for i in index.tolist()]
         filled = set(slots.facility.tolist())
-        facilities = [f for row in self.rows for f in facilities_of(row, filled)]
+        facilities = [f for row in self.rows for f in supply.facilities_of(row, filled)]
         goals, weights = weighted_goals(
             self.place.elements, self.buildings, self.frame, self.tree, self.beside
         )
@@ -475,7 +465,7 @@ class _TownImport(MapImport):
             entry_weights=dict.fromkeys(PURPOSES, traffic),
             turns=turns.kept,
         ).searchable()
-        rows = table_of(self.rows, draft)
+        rows = supply.table_of(self.rows, draft)
         left_out = (
             *self.place.left_out,
             *self.closed_roads,
@@ -556,7 +546,7 @@ def _unseen_garages(
         return
     points = np.asarray(shapely.points(np.array(at)))
     alone = np.ones(len(points), bool)
-    garages = [a.polygon for a in parking if rule_of(a.element.tags) in GARAGES]
+    garages = [a.polygon for a in parking if supply.rule_of(a.element.tags) in supply.GARAGES]
     for outlines, reach in (([a.polygon for a in parking], ENTRANCE_WITHIN), (garages, SAME_GARAGE)):
         alone[shapely.STRtree(outlines).query(points, predicate="dwithin", distance=reach)[0]] = False
     index = np.flatnonzero(alone)
@@ -620,39 +610,35 @@ LEISURE = {"visitors": 1.0, "commuters": 0.1, "deliveries": 0.1}
 OPEN_TO_ALL = {"visitors": 0.5, "commuters": 0.5, "deliveries": 0.05}
 # Usual levels of a `building`, and whom a square metre of its floor attracts; of others nobody.
 BUILDINGS: dict[str, tuple[float, dict[str, float]]] = {
-    **dict.fromkeys(
-        ("house", "detached", "semidetached_house", "terrace", "bungalow", "farm"), (2.0, DWELLING)
-    ),
-    **dict.fromkeys(("yes", "residential", "block"), (2.0, DWELLING)),
-    **dict.fromkeys(("apartments", "dormitory"), (4.0, DWELLING)),
-    **dict.fromkeys(("office", "commercial", "government"), (3.0, WORK)),
-    **dict.fromkeys(
-        ("industrial", "manufacture", "warehouse"), (1.0, {"commuters": 0.3, "deliveries": 0.05})
-    ),
-    **dict.fromkeys(("retail", "supermarket", "kiosk", "mall"), (1.0, SHOP)),
-    **dict.fromkeys(
-        ("hotel", "cinema", "theatre", "stadium", "sports_hall", "sports_centre"), (2.0, LEISURE)
-    ),
-    **dict.fromkeys(("school", "kindergarten", "university", "college", "hospital"), (2.0, OPEN_TO_ALL)),
-    **dict.fromkeys(("public", "civic", "church", "train_station", "fire_station"), (1.0, OPEN_TO_ALL)),
+    name: (levels, attracts)
+    for names, levels, attracts in (
+        ("house detached semidetached_house terrace bungalow farm yes residential block", 2.0, DWELLING),
+        ("apartments dormitory", 4.0, DWELLING),
+        ("office commercial government", 3.0, WORK),
+        ("industrial manufacture warehouse", 1.0, {"commuters": 0.3, "deliveries": 0.05}),
+        ("retail supermarket kiosk mall", 1.0, SHOP),
+        ("hotel cinema theatre stadium sports_hall sports_centre", 2.0, LEISURE),
+        ("school kindergarten university college hospital", 2.0, OPEN_TO_ALL),
+        ("public civic church train_station fire_station", 1.0, OPEN_TO_ALL),
+    )
+    for name in names.split()
 }
 # Nominal floor, m², of a point with a key (`shop`, `office`, ...) or an `amenity`, and whom it attracts.
 POINTS: dict[str, tuple[float, dict[str, float]]] = {
-    "shop": (150.0, SHOP),
-    "office": (200.0, WORK),
-    "craft": (150.0, WORK),
-    "healthcare": (200.0, OPEN_TO_ALL),
-    "tourism": (300.0, LEISURE),
-    "leisure": (300.0, LEISURE),
-    **dict.fromkeys(("restaurant", "pub", "bar", "cafe", "fast_food", "nightclub"), (150.0, LEISURE)),
-    **dict.fromkeys(
-        ("cinema", "theatre", "library", "community_centre", "place_of_worship"), (400.0, LEISURE)
-    ),
-    **dict.fromkeys(("bank", "post_office", "pharmacy", "marketplace"), (200.0, SHOP)),
-    **dict.fromkeys(
-        ("doctors", "dentist", "clinic", "hospital", "townhall", "courthouse"), (300.0, OPEN_TO_ALL)
-    ),
-    **dict.fromkeys(("school", "kindergarten", "university", "college"), (500.0, OPEN_TO_ALL)),
+    name: (floor, attracts)
+    for names, floor, attracts in (
+        ("shop", 150.0, SHOP),
+        ("office", 200.0, WORK),
+        ("craft", 150.0, WORK),
+        ("healthcare", 200.0, OPEN_TO_ALL),
+        ("tourism leisure", 300.0, LEISURE),
+        ("restaurant pub bar cafe fast_food nightclub", 150.0, LEISURE),
+        ("cinema theatre library community_centre place_of_worship", 400.0, LEISURE),
+        ("bank post_office pharmacy marketplace", 200.0, SHOP),
+        ("doctors dentist clinic hospital townhall courthouse", 300.0, OPEN_TO_ALL),
+        ("school kindergarten university college", 500.0, OPEN_TO_ALL),
+    )
+    for name in names.split()
 }
 # Values of keys that no car comes for.
 QUIET = {
@@ -707,13 +693,6 @@ def _sources(
     elements: Sequence[OsmElement], buildings: Sequence[Area], frame: LocalFrame
 ) -> tuple[FloatArray, FloatArray]:
     """Return where anything attracts people, (n, 2) m, and how much, (n, n_purposes) m² of floor."""
-    positions: list[FloatArray] = []
-    rows: list[list[float]] = []
-
-    def add(at: FloatArray, floor: float, kind: Mapping[str, float]) -> None:
-        positions.append(at)
-        rows.append([floor * kind.get(purpose, 0.0) for purpose in PURPOSES])
-
     area = shapely.area([a.polygon for a in buildings])
     middle = shapely.get_coordinates(shapely.point_on_surface([a.polygon for a in buildings]))
     own = {a.element.id for a in buildings}
@@ -721,20 +700,20 @@ def _sources(
     here = np.array([frame.to_xy(e.lines[0]).mean(axis=0) for e, _ in points]).reshape(-1, 2)
     tree = shapely.STRtree([a.polygon for a in buildings])
     spoken_for = set(tree.query(shapely.points(here), predicate="intersects")[1].tolist())
-    for (_, (floor, attracts)), at in zip(points, here, strict=True):
-        add(at, floor, attracts)
+    sources = [(at, floor, attracts) for (_, (floor, attracts)), at in zip(points, here, strict=True)]
     for k, building in enumerate(buildings):
         tags = building.element.tags
         levels, attracts = BUILDINGS.get(tags["building"], (1.0, {}))
-        floor = float(area[k]) * (levels_of(tags) or levels)
+        floor = float(area[k]) * (supply.levels_of(tags) or levels)
         point = _point_of(tags)
         if point is not None:
             attracts = point[1]
         elif tags["building"] == "yes" and k in spoken_for:
             floor *= 0.5  # shops below, dwellings above
         if attracts and area[k] >= LEAST_AREA:
-            add(middle[k], floor, attracts)
-    return np.array(positions).reshape(-1, 2), np.array(rows).reshape(-1, len(PURPOSES))
+            sources.append((middle[k], floor, attracts))
+    weights = [[floor * kind.get(purpose, 0.0) for purpose in PURPOSES] for _, floor, kind in sources]
+    return np.array([at for at, _, _ in sources]).reshape(-1, 2), np.array(weights).reshape(-1, len(PURPOSES))
 
 
 def _point_of(tags: Mapping[str, str]) -> tuple[float, dict[str, float]] | None:

@@ -18,11 +18,10 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, ConfigDict, Field
 from scipy.optimize import linear_sum_assignment
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError, naming, require
 from parkenv.files.field_types import Name
 from parkenv.files.limited_reading import csv_records
@@ -41,6 +40,9 @@ from parkenv.lots.osm.conditions import (
     conditional,
     duration,
     hours_text,
+    kerb_conditions,
+    kerb_tag,
+    kerb_users,
     note_other_keys,
     opening,
     parking_users,
@@ -53,11 +55,8 @@ from parkenv.lots.osm.parking import (
     Junctions,
     Kerb,
     free_intervals,
-    kerb_conditions,
     kerb_of,
     kerb_slots,
-    kerb_tag,
-    kerb_users,
 )
 from parkenv.lots.osm.roads import SIDES, Rank, Road, Side, count_in
 from parkenv.lots.unread import note_unread
@@ -88,28 +87,27 @@ class Rules:
     hourly: str = ""  # prices by hours instead of `per_hour` and `charged`, as `Price.parse` reads them
 
     def zone(self, kind: str) -> Zone:
-        words = [kind]
-        if self.users != PUBLIC:
-            words.append(self.users)
-        if self.per_hour or self.hourly:
-            each = f"{24 * self.per_hour:g}/day" if self.by_day else f"{self.per_hour:g}/h"
-            words.append(self.hourly or ("paid" if self.assumed else each))
-            words += [f"at most {self.daily_cap:g}/day"] if self.daily_cap else []
-            words += [f"after {self.free_s / 60:g} min"] if self.free_s else []
-            words += [self.charged] if self.charged else []
-        elif self.users == PUBLIC:
-            words.append("free")
-        if self.max_stay_s is not None:
-            words.append(f"{self.max_stay_s / 60:g} min")
-            words += [self.charged] if self.charged and not self.per_hour else []
-        words += [f"open {self.hours}"] if self.hours else []
+        each = f"{24 * self.per_hour:g}/day" if self.by_day else f"{self.per_hour:g}/h"
+        paid = (
+            self.hourly or ("paid" if self.assumed else each),
+            f"at most {self.daily_cap:g}/day" if self.daily_cap else "",
+            f"after {self.free_s / 60:g} min" if self.free_s else "",
+            self.charged,
+        )
+        limited = (f"{(self.max_stay_s or 0.0) / 60:g} min", "" if self.per_hour else self.charged)
+        words = (
+            *(kind, "" if self.users == PUBLIC else self.users),
+            *(paid if self.per_hour or self.hourly else ("free" if self.users == PUBLIC else "",)),
+            *(() if self.max_stay_s is None else limited),
+            f"open {self.hours}" if self.hours else "",
+        )
         charged = Hours.parse(self.charged) if self.charged else None
         steps = ((DAY_S, 24 * self.per_hour),) if self.by_day else ()
         price = Price(self.per_hour, steps, self.free_s, self.daily_cap, charged)
         if self.hourly:
             price = replace(Price.parse(self.hourly), daily_cap=self.daily_cap)
         hours = Hours.parse(self.hours) if self.hours else None
-        return Zone(" ".join(words), price, hours, self.max_stay_s, (self.users,))
+        return Zone(" ".join(filter(None, words)), price, hours, self.max_stay_s, (self.users,))
 
 
 def rules_of(tags: Mapping[str, str]) -> Rules:
@@ -148,22 +146,16 @@ def _rules(
     users: str, open_at: BoolArray, tags: Mapping[str, str], fee_key: str, fee: Conditional,
     charge_key: str, stay_key: str, limited: BoolArray,
 ) -> Rules:  # fmt: skip
-    charge, clauses = Charge(PRICE), list[tuple[Charge, BoolArray]]()
-    paid = _paid_at(tags, fee_key, fee)
+    charge, paid = Charge(PRICE), _paid_at(tags, fee_key, fee)
     (text, at_times), _ = conditional(tags, charge_key)
     read = [(charge_in(text) if text else None, always())]
     read += [(charge_in(value), when) for value, when in at_times]
     if any(known is None for known, _ in read[not text :]):
-        note_unread(
-            tags,
-            charge_key if text and read[0][0] is None else f"{charge_key}:conditional",
-            f"{PRICE:g} an hour",
-        )
-    for known, when in read:
-        if known is not None:
-            clauses.append((known, when))
-            if known.doubt:
-                note_unread(tags, charge_key, known.doubt)
+        key = charge_key if text and read[0][0] is None else f"{charge_key}:conditional"
+        note_unread(tags, key, f"{PRICE:g} an hour")
+    clauses = [(known, when) for known, when in read if known is not None]
+    for doubt in (known.doubt for known, _ in clauses if known.doubt):
+        note_unread(tags, charge_key, doubt)
     if clauses:
         named = fee_key in tags or fee[1]
         covered = np.any([when for _, when in clauses], axis=0)
@@ -181,10 +173,7 @@ def _rules(
     hourly = ""
     if len(by_hour) > 1:
         hourly = "; ".join(
-            f"{price:g} @ {rule}"
-            for price, minutes in by_hour.items()
-            for rule in hours_text(minutes).split("; ")
-            if not rule.endswith(" off")
+            f"{price:g} @ {rule}" for price, when in by_hour.items() for rule in _open_rules(when)
         )
     elif clauses:
         paid = next(iter(by_hour.values()), ~always())
@@ -194,7 +183,7 @@ def _rules(
     counted = paid if is_paid else limited
     if stay is not None and is_paid and (limited != paid).any() and not limited.all():
         note_unread(tags, stay_key, "a limit of stays in the charged hours")
-    charged = _without_off(hours_text(counted)) if is_paid or stay is not None else ""
+    charged = "; ".join(_open_rules(counted)) if is_paid or stay is not None else ""
     return Rules(
         users,
         round(charge.per_hour, 4 if charge.by_day else 2) if is_paid and not hourly else 0.0,
@@ -249,8 +238,10 @@ def _longest_stay(tags: Mapping[str, str], key: str, limited: BoolArray) -> tupl
     return min(limits, key=lambda limit: limit[0])
 
 
-def _without_off(text: str) -> str:
-    return "; ".join(rule for rule in text.split("; ") if not rule.endswith(" off")) or text
+def _open_rules(minutes: BoolArray) -> list[str]:
+    """Return the rules of hours, without those of days that have none; of no hours at all that of these."""
+    rules = hours_text(minutes).split("; ")
+    return [rule for rule in rules if not rule.endswith(" off")] or rules
 
 
 class AreaRule(NamedTuple):
@@ -392,7 +383,7 @@ def read_listed(path: Path) -> list[ListedCarPark]:
 
 def matched(
     listed: list[ListedCarPark], at: FloatArray, names: list[str], capacity: FloatArray, xy: FloatArray
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Return which facility each car park of a list, at (k, 2) m, is: index or -1, each at most once; nearest in all.
 
     It is within `NEAR` and of like capacity, or shares a rare word with the name within `SAME_NAME` times as far.
