@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from test_search_vector import recorded_scenario
+from test_sensors_env import SMALL_RIG
 
 import parkenv
+from parkenv import Traffic
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots.generators import grid_lot
@@ -105,6 +107,25 @@ class Cars:
         return last, self.at_once.step(dict.fromkeys(self.at_once.agents, action))
 
 
+class Drive:
+    """A car that is driven among others, by pedal and wheel."""
+
+    def __init__(self):
+        options = {
+            "lot": "campus",
+            "traffic": Traffic(cars=6, pedestrians=8),
+            "laser": True,
+            "obstacle_map": True,
+        }
+        self.env = gym.make("parkenv/Drive-v1", **options).unwrapped
+
+    def reset(self, seed):
+        return self.env.reset(seed=seed)
+
+    def step(self, action):
+        return self.env.step([0.2 * action, -0.7])
+
+
 class FleetOfAgents:
     """A fleet under way, half of it driven by compiled policies."""
 
@@ -136,8 +157,9 @@ KINDS = {
     "full": single,
     "local": lambda: single(observation="local"),
     "occupancy": lambda: single(observation="occupancy", flat=True),
-    "scans": lambda: single("SearchSensors-v2", observation="scan"),
+    "pictures": lambda: single("SearchSensors-v2", rig=SMALL_RIG),
     "recorded": lambda: single("SearchSensors-v2", scenario=recorded_scenario(), observation="scan"),
+    "places": lambda: single(scenario=["mini", grid_lot(3, 8)]),
     "wrapped": lambda: LocalObservation(gym.make("parkenv/Search-v2", scenario="mini")),
     "model": ModelState,
     "batch": Batch,
@@ -236,16 +258,19 @@ def test_a_batch_goes_on_from_a_state_in_which_searches_have_ended(mode, observa
         assert go_on(each) == wanted
 
 
-@pytest.mark.parametrize("make", [single, lambda: gym.make("parkenv/Drive-v1").unwrapped])
-def test_a_saved_state_has_the_seed_of_the_episodes_to_come(make):
-    env, other = make(), make()
-    env.reset(seed=7)
+@pytest.mark.parametrize("name", ["full", "local", "pictures", "recorded", "places", "drive"])
+def test_a_saved_state_is_gone_on_from_in_any_environment_of_its_kind(name):
+    """In the middle of another search, and later in its own; the seed of the episodes to come is in it."""
+    world, other = (Drive() if name == "drive" else KINDS[name]() for _ in range(2))
+    env, another = (getattr(each, "env", each) for each in (world, other))
+    world.reset(seed=3)
+    world.step(3)
     saved = pickle.loads(pickle.dumps(env.get_state()))
-    wanted = parts(env.reset())
-    other.reset(seed=1)
-    for each in (env, other):
-        each.set_state(saved)
-        assert parts(each.reset()) == wanted
+    wanted = run(world, DRIVEN[1:3]), parts(env.reset())
+    other.reset(seed=9)
+    for each, its in ((other, another), (world, env)):
+        its.set_state(saved)
+        assert (run(each, DRIVEN[1:3]), parts(its.reset())) == wanted
 
 
 @pytest.mark.parametrize(("seed", "parked"), [(0, True), (11, False)])

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from command_line import ran, refused, rows_in, summary_of
+from command_line import ran, rows_in, summary_of
 from small_lots import features
 
 import parkenv
@@ -209,7 +209,3 @@ def test_the_command_writes_what_other_models_read(district, tmp_path):
     assert (low <= value).all()
     assert (value <= high).all()
     assert set(OUTCOMES) <= set(next(iter(curves.curves.values())))
-
-
-def test_a_curve_is_of_equal_drivers(tmp_path):
-    assert "agents" in refused("curve", "town", "--agents", "usual,greedy-total", "--out", tmp_path / "a")

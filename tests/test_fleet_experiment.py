@@ -117,26 +117,6 @@ def test_the_closed_form_of_random_looks_ends_at_the_last_slot():
     assert all_but_none - one == pytest.approx(20 * hop_s, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--knows", "own,al"), "--knows is 'al'"),
-        (("--knows", "own,own"), "'own' is repeated"),
-        (("--share", "0.5,1.5"), "--share is 1.5"),
-        (("--share", ""), "--share is []"),
-        (("--arrivals-per-hour", "0"), "--arrivals-per-hour is '0'"),
-        (("--stay-min", "inf"), "--stay-min is 'inf'"),
-        (("--hours", "08:00-08:00"), "the arrivals of 'mini' are at one time"),
-        (("--calibrated", "nothing.json"), "nothing.json"),
-        (("--arrivals-per-hour", "1e6"), "1,000,000"),
-        (("--agents", "oracle"), "agent 'oracle'"),
-    ],
-)
-def test_bad_input_is_refused_before_anything_is_run(words, message, tmp_path):
-    assert message in refused("fleet", "--scenario", "mini", *words, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_an_experiment_without_bounds_is_refused():
     with pytest.raises(InputError, match="40000000 days"):
         experiment(days=10_000, arrivals_per_hour=tuple(map(float, range(1, 1001))))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import ran, refused, rows_in
+from command_line import ran, rows_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lot_checks import refusal
@@ -369,11 +369,6 @@ def test_a_town_comes_back_from_its_file_and_the_command_writes_its_table(tmp_pa
 )
 def test_what_is_no_town_is_refused_in_one_line(tmp_path, place, message):
     assert message in refusal(draft, place, tmp_path)
-
-
-def test_a_town_is_no_place_of_entries_and_car_parks(tmp_path):
-    for option in (("--split",), ("--entry", "0,0"), ("--bounds", "0,0,999,9")):
-        assert "--town" in refused("lot import a.osm --town --out a.geojson", *option, cwd=tmp_path)
 
 
 def test_a_part_is_cut_out_and_a_town_of_guessed_kerbs_says_so(tmp_path):

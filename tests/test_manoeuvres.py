@@ -246,19 +246,6 @@ def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "wanted"),
-    [
-        ("--levels parallel-extrem", "parallel-extreme"),
-        ("--levels all --cases .", "exclude each other"),
-        ("--levels all --vehicle tank", "tank"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(options, wanted, tmp_path):
-    assert wanted in refused(f"park {options} --out out", cwd=tmp_path)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
     ("target", "obstacles", "length", "clearance"),
     [
         ([1.0, 3.0, 0.0], [{"line": [[-5.0, -2.0], [9.0, -2.0]]}], 0.0, pytest.approx(4.1, abs=0.01)),

@@ -72,30 +72,6 @@ def test_the_local_observation_by_name_is_that_of_the_wrapper(name):
         assert results == expected
 
 
-@pytest.mark.parametrize("mode", ["sync", "async", "vector_entry_point"])
-@pytest.mark.parametrize("observation", ["full", "occupancy", "local"])
-def test_batches_of_every_kind_have_the_observations_and_a_closed_one_none(mode, observation):
-    envs = gym.make_vec("parkenv/Search-v2", 2, mode, scenario="mini", observation=observation)
-    one = gym.make("parkenv/Search-v2", scenario="mini", observation=observation)
-    batch, single = envs.reset(seed=4)[0], one.reset(seed=4)[0]
-    assert set(batch) == set(single)
-    for key, value in single.items():
-        np.testing.assert_array_equal(batch[key][0], value)
-    envs.close()
-    if mode == "vector_entry_point":
-        with pytest.raises(ResetNeeded):
-            envs.step(np.zeros(2, int))
-
-
-def test_a_copy_of_a_state_holds_the_local_observation():
-    env = gym.make("parkenv/Search-v2", scenario="mini", observation="local").unwrapped
-    env.reset(seed=1)
-    env.step(3)
-    state, ahead = env.get_state(), [env.step(3)[0]["local"] for _ in range(4)]
-    env.set_state(state)
-    np.testing.assert_array_equal([env.step(3)[0]["local"] for _ in range(4)], ahead)
-
-
 def test_a_planner_says_what_it_needs_of_a_local_observation():
     env = gym.make("parkenv/Search-v2", scenario="mini", observation="local")
     with pytest.raises(InputError, match="observation holds local, action_mask, want"):

@@ -2,7 +2,6 @@
 
 import copy
 import os
-import pickle
 import subprocess
 import sys
 
@@ -128,19 +127,6 @@ def test_pictures_of_another_width():
     for wrong in (True, 12, 3.5):
         with pytest.raises(InputError, match="picture_width is"):
             make(picture_width=wrong)
-
-
-def test_state_comes_back_with_its_pictures():
-    env = make().unwrapped
-    env.reset(seed=2)
-    env.step(3)
-    saved, twin, thawed = env.get_state(), copy.deepcopy(env), pickle.loads(pickle.dumps(env))
-    after = env.step(3)[0]
-    other = make().unwrapped
-    other.reset(seed=9)
-    other.set_state(saved)
-    for again in (twin, thawed, other):
-        assert data_equivalence(again.step(3)[0], after, exact=True)
 
 
 @pytest.mark.parametrize(

@@ -452,22 +452,3 @@ def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch
         "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.safetensors'}",
         "-n", 2, "--occupancy-levels", "none", "--no-figures", "--jobs", 1, "--out", tmp_path / "compared",
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"algorithm": "sac"}, "algorithm is 'sac', want 'ppo', 'maskable-ppo', 'recurrent-ppo' or 'dqn'"),
-        ({"agents": ["mdp", "belif"]}, "unknown agent 'belif'"),
-        ({"algorithm": "ppo", "clone": "oracle"}, "oracle cannot be cloned"),
-        ({"algorithm": "dqn", "clone": "mdp"}, "dqn has no behaviour cloning"),
-        ({"demonstrations": 5}, "demonstrations requires clone"),
-        ({"held_out": 0.0}, "held_out is 0.0, want a number above 0"),
-        ({"held_out": 0.5, "evaluate_on": ["mini"]}, "at most one of held_out, evaluate_on"),
-        ({"curriculum": "age"}, "curriculum is 'age', want 'size'"),
-        ({"evaluate_on": ["nowhere"]}, "unknown scenario 'nowhere'"),
-    ],
-)
-def test_trainings_that_make_no_sense_are_refused(fields, message):
-    with pytest.raises(InputError, match=message):
-        TrainingSpec.parse(fields, "file").training.check()
