@@ -138,3 +138,20 @@ def one_street(length=100.0, **tags):
     """A street without crossings, and a house."""
     place = Map().way([(0, 0), (length, 0)], {"highway": "residential", **tags})
     return place.box(30, 20, 50, 30, {"building": "house"})
+
+
+HOUSE_ROWS = (-20, 20, 180, 220, 380, 420)
+
+
+def grid(**tags):
+    """Three streets of 400 m each way, 200 m apart, with houses along them, and a shop; all leave the map."""
+    place = Map()
+    for y in (0, 200, 400):
+        place.way([(-100, y), (0, y), (200, y), (400, y), (500, y)], {"highway": "residential"}, **tags)
+    for x in (0, 200, 400):
+        place.way([(x, -100), (x, 0), (x, 200), (x, 400), (x, 500)], {"highway": "residential"}, **tags)
+    for along in range(-90, 500, 40):
+        for beside in HOUSE_ROWS:
+            place.box(along, beside - 8, along + 16, beside + 8, {"building": "house"})
+            place.box(beside - 8, along, beside + 8, along + 16, {"building": "house"})
+    return place.node(100, 215, shop="bakery")

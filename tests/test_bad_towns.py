@@ -10,8 +10,7 @@ import pytest
 from car_park_counts import write_counts
 from command_line import refused
 from lot_checks import refusal
-from made_maps import STREET
-from test_import_town import grid
+from made_maps import STREET, grid
 
 from parkenv import make_scenario
 from parkenv.lots.osm import elements

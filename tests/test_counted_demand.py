@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from car_park_counts import write_counts
 from command_line import parkenv, ran, summary_of
-from made_maps import FREIBURG, STREET
-from test_import_town import grid
+from made_maps import FREIBURG, STREET, grid
 
 from parkenv import InputError, ParkingLot, make_scenario
 from parkenv.lots import write_lot

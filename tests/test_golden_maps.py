@@ -5,22 +5,26 @@
 A change of a lot on purpose is recorded with it; `git diff` shows which slots, lanes, entries or reasons changed.
 """
 
+import itertools
 import json
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
-from made_maps import AISLE, SERVICE, SPACE, STREET, Map, car_park, one_street, outline_alone
+from made_maps import AISLE, SERVICE, SPACE, STREET, Map, car_park, grid, one_street, outline_alone
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.errors import InputError
 from parkenv.lots.generators import nearest_on_lanes
+from parkenv.lots.town.draft import import_town
 from parkenv.world.drive_graph import SLOT_REACH
 
 GOLDENS = Path(__file__).with_name("golden_maps.json")
 KERBS = {"highway": "residential", "parking:both": "lane"}
+NONE, LEFT = {"parking:both": "no"}, {"restriction": "no_left_turn"}
 
 
 def private_parking():
@@ -134,6 +138,118 @@ MAPS = {
 }  # fmt: skip
 
 
+def restricted(**relation):
+    """Two streets that cross, a way for each arm, kerbs beside all, and a restriction from the west to the north."""
+    place = Map()
+    for x, y in ((-1, 0), (1, 0), (0, 1), (0, -1)):
+        place.way([(200 * x, 200 * y), (100 * x, 100 * y), (0, 0)], STREET, **{"parking:both": "lane"})
+    corners = [(-200, 200), (200, 200), (200, -200), (-200, -200), (-200, 200)]
+    for (x0, y0), (x1, y1) in itertools.pairwise(corners):
+        place.way([(x0, y0), ((x0 + x1) // 2, (y0 + y1) // 2), (x1, y1)], STREET)
+    if relation:
+        place.turn(1, (0, 0), 3, **relation)
+    place.way([(200, 0), (400, 0)], STREET)
+    return place.node(10, 10, entrance="main")
+
+
+def speeds():
+    place, said = grid(), {-60: "30", -80: "25 mph", -90: "walk"}
+    for y in (-40, *said):
+        tags = {"maxspeed": said[y]} if y in said else {}
+        place.way([(0, -100 if y == -90 else y - 10), (150, y - 10)], {"highway": "primary"}, **tags)
+        place.way([(0, 0), (0, y - 10)], STREET)
+    return place
+
+
+def car_parks():
+    """By tags, with an open outline, as where the edge of a map cuts it; private; and with levels, by its node."""
+    p1 = {"amenity": "parking", "name": "P1", "capacity": "77", "capacity:disabled": "4"}
+    place = grid(**NONE).way([(20, 20), (60, 20), (60, 60), (20, 60)], p1)
+    place.box(80, 20, 120, 60, {"amenity": "parking", "name": "P2", "access": "private"})
+    garage = {
+        "amenity": "parking",
+        "name": "P3",
+        "parking": "multi-storey",
+        "fee": "yes",
+        "building:levels": "3",
+    }
+    place.box(140, 20, 180, 60, garage)
+    return place.node(160, 62, amenity="parking_entrance").node(230, 230, amenity="parking", name="P4")
+
+
+def drawn_in_part():
+    place = grid(**NONE).way([(20, 0), (20, 60)], SERVICE).way([(20, 30), (60, 30)], AISLE)
+    place.box(15, 20, 65, 45, {"amenity": "parking", "name": "Markt", "capacity": "20", "maxstay": "2 hours"})
+    for k in range(8):
+        x, tags = 22 + 2.5 * k, {"parking_space": "disabled"} if k == 0 else {}
+        place.box(x, 33, x + 2.5, 38, SPACE, **tags)
+    return place
+
+
+def entrances():
+    place = grid(**NONE).box(20, 20, 60, 60, {"amenity": "parking", "parking": "underground"})
+    place.node(70, 40, amenity="parking_entrance").node(230, 230, amenity="parking_entrance", name="Dom")
+    place.node(240, 230, amenity="parking_entrance")
+    return place.node(230, 30, amenity="parking_entrance", capacity="80")
+
+
+ODD = {
+    "amenity": "parking",
+    "capacity:hgv": "4",
+    "access:times": "Mo",
+    "opening_hours:covid19": "off",
+    "charge:rate": "2",
+}
+TOWNS = {
+    "streets: apart": grid()
+    .way([(2500, 1400), (2550, 1400)], STREET, name="Inselweg")
+    .way([(500, 0), (2500, 0)], STREET, oneway="yes", name="Fernweg"),
+    "speeds: tagged, else by class": speeds(),
+    "kerbs: none": grid(**NONE).box(90, 90, 110, 100, {"amenity": "parking"}),
+    "kerbs: none, old": grid(**{"parking:lane:both": "no_parking"}).box(
+        90, 90, 110, 100, {"amenity": "parking"}
+    ),
+    "kerbs: right": grid(**{"parking:left": "no", "parking:right": "lane"}),
+    "kerbs: left, old": grid(**{"parking:lane:left": "parallel", "parking:lane:right": "no_stopping"}),
+    "kerbs: capacity": grid(**{RIGHT: "lane", f"{RIGHT}:capacity": "31", "parking:left": "no"}),
+    "car parks: by tags, area and levels": car_parks(),
+    "car parks: drawn in part": drawn_in_part(),
+    "car parks: far or closed": grid()
+    .box(1000, 1000, 1040, 1040, {"amenity": "parking"})
+    .box(90, 90, 95, 95, {"amenity": "parking", "access": "no"}),
+    "garages: entrances": entrances(),
+    "rules: keys that nobody reads": grid(
+        **{
+            "parking:both": "lane",
+            "parking:left:times": "Mo-Fr",
+            "parking:lane:both:conditional": "no @ (We)",
+        },
+        **{f"{RIGHT}:maxstay:conditional": "1 h @ (Mo-Fr)", "parking:left:orientation": "diagonal"},
+    ).box(
+        20,
+        20,
+        60,
+        50,
+        ODD | {"capacity": "9", "access": "yes", "maxstay:conditional": "1 h @ (Mo)", "fee:note": "x"},
+    ),
+    "goals: along streets": Map()
+    .way([(0, 0), (300, 0)], STREET, **{"parking:both": "lane"})
+    .way([(0, 90), (300, 90)], STREET, **{"parking:both": "lane"})
+    .way([(0, 0), (0, 300)], STREET)
+    .way([(90, 0), (90, 300)], STREET),
+    "turns: none": restricted(),
+    "turns: left": restricted(**LEFT),
+    "turns: only": restricted(restriction="only_straight_on"),
+    "turns: cars": restricted(**{"restriction:motorcar": "no_left_turn", "except": "bicycle; psv"}),
+    "turns: except cars": restricted(**LEFT, **{"except": "psv; motorcar"}),
+    "turns: hours": restricted(**{"restriction:conditional": "no_left_turn @ (Mo-Fr 07:00-09:00)"}),
+    "turns: lorries": restricted(**{"restriction:hgv": "no_left_turn"}),
+    "turns: unknown": restricted(restriction="no_flying"),
+    "turns: no via": restricted(**LEFT, roles=("from", "to")),
+    "turns: two vias": restricted(**LEFT, roles=("from", "via", "via", "to")),
+}
+
+
 def described(name, folder):
     """What a map becomes, in values that a reader can compare, rounded to a centimetre."""
     draft = MAPS[name].draft(folder)
@@ -149,6 +265,37 @@ def described(name, folder):
         "found": [line for line in draft.found if not line.startswith("frame")],
         "missing": len(draft.missing),
     }
+
+
+def described_town(name, folder):
+    """What a town of a map is, in values that a reader can compare."""
+    town = import_town(TOWNS[name].write(folder / "town.osm"))
+    draft, lot = town.draft, town.draft.lot()
+    columns = ("name", "kind", "capacity", "capacity_from", "tagged", "slots", "zone")
+    return lot, {
+        "facilities": [[row[column] for column in columns] for row in town.facilities],
+        "known": {f.name: [f.kind, f.zone, f.known, f.capacity] for f in lot.facilities if f.is_counted},
+        "zones": {name: [list(zone.users), zone.max_stay_s] for name, zone in lot.zone_rules.items()},
+        "slots": Counter(lot.slot_zone.tolist()),
+        "speeds": sorted({round(lane.speed, 2) for lane in lot.lanes}),
+        "vertices": [len(lot.entries), len(lot.goals), lot.n_vertices],
+        "goals": (lot.goals.min(axis=0).round() + 0.0).tolist()
+        + (lot.goals.max(axis=0).round() + 0.0).tolist(),
+        "turns": [[turn.only, *(turn.points - turn.points[1]).round(1).tolist()] for turn in lot.turns],
+        "left_out": {left.reason: list(left.ids) for left in draft.left_out},
+        "unread": [[row.tag, row.value, row.count, row.assumed] for row in draft.unread],
+        "guesses": list(draft.guesses),
+        "found": [line for line in draft.found if not line.startswith("frame")],
+    }
+
+
+@pytest.mark.parametrize("name", TOWNS)
+def test_a_map_becomes_its_town(tmp_path, name):
+    lot, town = described_town(name, tmp_path)
+    assert json.loads(json.dumps(town)) == json.loads(GOLDENS.read_text(encoding="utf-8"))[name]
+    assert lot.capacity.sum() == sum(capacity for _, _, capacity, *_ in town["facilities"])
+    reached = dijkstra(lot.drive_matrix(), indices=np.arange(0, lot.n_slots, 97))
+    assert np.isfinite(reached[:, : lot.n_slots]).all()
 
 
 @pytest.mark.parametrize("name", MAPS)
@@ -190,5 +337,6 @@ def assert_sound(lot):
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as place:
         lots = {name: described(name, Path(place))[1] for name in MAPS}
+        lots |= {name: described_town(name, Path(place))[1] for name in TOWNS}
     lines = [f"{json.dumps(name)}: {json.dumps(lot, ensure_ascii=False)}" for name, lot in lots.items()]
     GOLDENS.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")

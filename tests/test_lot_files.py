@@ -78,11 +78,12 @@ def with_exact(slot, **changes):
     name=st.text().filter(is_plain),
     goal=points,
     walls=st.lists(st.lists(points, min_size=2, max_size=5), max_size=3),
+    speed=st.floats(0.25, 4.0),
     cost=st.just(0.0) | st.floats(0.0, 1e8),
     zone=st.text(alphabet="centre, 1=ä", max_size=8),
 )
 def test_written_lots_are_read_back_to_the_bit(
-    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls, cost, zone
+    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls, speed, cost, zone
 ):
     grid = grid_lot(rows, columns, name=name, pitch=pitch, aisle=aisle)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -95,7 +96,7 @@ def test_written_lots_are_read_back_to_the_bit(
         slot_xy=moved(grid.slot_xy),
         slot_yaw=grid.slot_yaw + turn,
         lanes=tuple(
-            Lane(moved(lane.points), oneway)
+            Lane(moved(lane.points), oneway, speed)
             for lane, oneway in zip(grid.lanes, [True] + [False] * 9, strict=False)
         ),
         entries=moved(grid.entries),

@@ -11,7 +11,6 @@ from gymnasium.wrappers import TimeLimit
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from lot_checks import refusal
-from made_maps import STREET, Map
 from scipy.sparse.csgraph import dijkstra
 from small_lots import driven
 
@@ -19,7 +18,6 @@ from parkenv import make_agent, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.lots import check_lot, read_lot, write_lot
-from parkenv.lots.town.draft import import_town
 from parkenv.mapping.route import survey_route
 from parkenv.studies.simulate import adapt_to_agent
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
@@ -204,20 +202,6 @@ def test_turns_come_back_from_a_file_and_faults_are_named(tmp_path):
         assert refusal(read_lot, path) == f"{path}: feature {first}: {problem.message}"
 
 
-def crossing(**relation):
-    """Two streets that cross, a way for each arm, kerbs beside all, and a restriction from the west to the north."""
-    place = Map()
-    for x, y in ARMS.values():
-        place.way([(200 * x, 200 * y), (100 * x, 100 * y), (0, 0)], STREET, **{"parking:both": "lane"})
-    corners = [(-200, 200), (200, 200), (200, -200), (-200, -200), (-200, 200)]
-    for (x0, y0), (x1, y1) in itertools.pairwise(corners):
-        place.way([(x0, y0), ((x0 + x1) // 2, (y0 + y1) // 2), (x1, y1)], STREET)
-    if relation:
-        place.turn(1, (0, 0), 3, **relation)
-    place.way([(200, 0), (400, 0)], STREET)
-    return place.node(10, 10, entrance="main")
-
-
 def test_a_junction_is_blocked_for_all_who_come_to_it():
     ends = []
     for turns in ([], BACK):  # nobody turns back
@@ -240,39 +224,3 @@ def test_a_survey_passes_every_slot_once_without_them(turns):
     assert (lot.neighbors[route.vertices[:-1]] == route.vertices[1:, None]).any(axis=1).all()
     assert sorted(route.vertices[route.vertices < lot.n_slots]) == list(range(lot.n_slots))
     assert route.length == pytest.approx(plain.length)
-
-
-def imported(place, tmp_path):
-    draft = place.draft(tmp_path)
-    return draft, [line for line in draft.found if line.startswith("turn restrictions")]
-
-
-def test_a_restriction_of_the_map_is_a_turn_of_the_lot(tmp_path):
-    draft, (line,) = imported(crossing(restriction="no_left_turn"), tmp_path)
-    assert line == "turn restrictions: 1 kept"
-    (restriction,) = draft.turns
-    assert not restriction.only
-    ways = restriction.points - restriction.points[1]
-    np.testing.assert_allclose(ways, [(-100, 0), (0, 0), (0, 100)], atol=0.05)
-    plain, nothing = imported(crossing(), tmp_path)
-    assert nothing == []
-    assert draft.lot().n_vertices == plain.lot().n_vertices + 1
-
-
-@pytest.mark.parametrize(
-    ("tags", "wanted"),
-    [
-        ({"restriction": "only_straight_on"}, "1 kept"),
-        ({"restriction:motorcar": "no_left_turn", "except": "bicycle; psv"}, "1 kept"),
-        ({"restriction": "no_left_turn", "except": "psv; motorcar"}, "except cars: 1"),
-        ({"restriction:conditional": "no_left_turn @ (Mo-Fr 07:00-09:00)"}, "at some hours only: 1"),
-        ({"restriction:hgv": "no_left_turn"}, "for other vehicles: 1"),
-        ({"restriction": "no_flying"}, "damaged: 1"),
-        ({"restriction": "no_left_turn", "roles": ("from", "to")}, "damaged: 1"),
-        ({"restriction": "no_left_turn", "roles": ("from", "via", "via", "to")}, "damaged: 1"),
-    ],
-)
-def test_what_is_not_for_all_cars_at_all_hours_is_counted(tmp_path, tags, wanted):
-    found = import_town(crossing(**tags).write(tmp_path / "map.osm")).draft.found
-    (line,) = (line for line in found if line.startswith("turn restrictions"))
-    assert wanted in line
