@@ -1,15 +1,20 @@
 """Counts of car parks: their faults, each cleaned and counted."""
 
+import json
 from datetime import UTC, date, datetime, timedelta, timezone
+from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
+from car_park_counts import write_counts
+from command_line import parkenv, ran, refused, summary_of
 from scipy.special import logit
 
 from parkenv import InputError
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.event_table import is_counts
+from parkenv.forecast.slot_comparison import OURS
 from parkenv.forecast.typical_week_fit import usual_days
 
 CAPACITY = 200
@@ -309,3 +314,90 @@ def test_usual_days_need_another_day_and_fill_hours_without_a_reading():
     assert np.isfinite(sd).all()
     with pytest.raises(InputError, match="counted on 1 days, want at least two"):
         usual_days(y[:1], np.array([0]), "counts")
+
+
+KEYS = ("model", "log_loss", "brier", "crps", "coverage_90", "days", "car_parks")
+
+
+def write(path, days, fault=False):
+    def change(park, day, taken):
+        return 1.03 if fault and (park, day) == (1, 2) else taken
+
+    return write_counts(path, days=days, change=change)
+
+
+@pytest.mark.slow
+def test_an_evaluation_has_a_row_and_a_picture_for_each_model(tmp_path):
+    counts = write(tmp_path / "counts.csv", 60, fault=True)
+    ended = ran("occupancy", "evaluate", counts, "--from", "2024-02-10", "--out", tmp_path / "out")
+    summary = summary_of(tmp_path / "out")
+    models = [row["model"] for row in summary["rows"]]
+    assert models == ["day-curves", "last-four-weekdays", "last-week", "hour-mean", "gradient-boosting"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(
+        [*(f"{m}.png" for m in models), "summary.json"]
+    )
+    for row in summary["rows"]:
+        assert set(KEYS) <= set(row)
+        assert (row["days"], row["car_parks"]) == (20, 2)
+        assert sum(band["days"] for band in row["coverage_90_by_band"]) == 40
+    assert summary["faults"]["negative"] == summary["faults_by_car_park"]["P1"]["negative"] == 24
+    assert "negative 24" in ended.stdout
+    chosen = ("--from", "2024-02-10", "--car-parks", "P1")
+    again = ran("occupancy", "evaluate", counts, *chosen, "--out", tmp_path / "b")
+    assert again.stdout.startswith(("Fit", "1 car park"))
+    assert summary_of(tmp_path / "b")["rows"][0]["car_parks"] == 1
+
+
+@pytest.mark.parametrize(
+    ("days", "options"),
+    [(1, []), pytest.param(3, ["--from", "2024-01-01"], marks=pytest.mark.slow)],
+)
+def test_a_short_record_is_no_trouble(tmp_path, days, options):
+    counts = write(tmp_path / "counts.csv", days)
+    assert not ran("occupancy", "evaluate", counts, *options, "--out", tmp_path / "out").stderr
+
+
+def test_a_fit_states_day_errors_drift_and_faults(tmp_path):
+    counts = write(tmp_path / "counts.csv", 40, fault=True)
+    assert not ran("occupancy", "fit", counts, "--out", tmp_path / "out").stderr
+    summary = summary_of(tmp_path / "out")
+    rows = {row["car_park"]: row for row in summary["rows"]}
+    assert {name: row["negative"] for name, row in rows.items()} == {"P0": 0, "P1": 24, "empty": 0}
+    assert all(rows[name]["day_error"] == pytest.approx(0.5, abs=0.15) for name in ("P0", "P1"))
+    assert 0 < summary["level_drift_per_week"] < 1
+    assert summary["typical_week"] is None, "40 days are too few"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--from", "May"], "--from is 'May'"),
+        (["--from", "2025-01-01"], "no usable readings"),
+        (["--car-parks", "c"], "'c'"),
+        (["--timezone", "Mars"], "timezone is 'Mars'"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_a_line(tmp_path, options, message):
+    counts = write(tmp_path / "counts.csv", 2)
+    assert message in refused("occupancy", "evaluate", counts, *options, "--out", tmp_path / "out")
+
+
+REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
+
+
+@pytest.mark.slow  # fits five models to ten days of a real log
+def test_the_real_logs_slots_are_forecast_better_than_by_simple_models(tmp_path):
+    if not REAL_LOG.exists():
+        pytest.skip("the CNRPark-EXT log is not in shared/data")
+    done = parkenv("occupancy", "evaluate", REAL_LOG, "--from", "2015-11-25", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    assert rows[0]["model"] == OURS
+    assert rows[0]["days"] == 10
+    assert rows[0]["log_loss"] < 0.96 * min(row["log_loss"] for row in rows[1:])
+    assert rows[0]["brier"] < min(row["brier"] for row in rows[1:])
+    assert min(row["difference_ci95"][0] for row in rows[1:]) > 0
+    assert all((tmp_path / f"{row['model']}.png").exists() for row in rows)
+    done = parkenv("occupancy", "evaluate", REAL_LOG, "--from", "2017-01-01", "--out", tmp_path)
+    assert done.returncode == 2
+    assert "has no day from then on with one of its class before it" in done.stderr

@@ -6,15 +6,20 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 import types
 from datetime import date
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
+import yaml
 from car_park_counts import write_counts
 from command_line import ran
 from test_command_line import COMMANDS
 
+import parkenv
+from parkenv.studies.benchmark.suite import RESULT_VERSION, Suite
 from planners.names import AGENTS
 
 ROOT = Path(__file__).parents[1]
@@ -216,3 +221,80 @@ def test_an_example_says_how_long_it_takes(path):
     if path.stem not in ("ground_detector", "shorten_drives"):
         said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
         assert re.search(r"\b(seconds|minutes?)\b", said), f"{path}: says not how long it takes"
+
+
+NOTEBOOK = Path(__file__).parents[1] / "examples" / "main_story.ipynb"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_notebook_runs_and_shows_its_pictures(tmp_path):
+    nbformat = pytest.importorskip("nbformat")
+    client = pytest.importorskip("nbclient").NotebookClient
+    notebook = nbformat.read(NOTEBOOK, 4)
+    client(notebook, timeout=1800).execute(cwd=str(tmp_path))
+    shown = [
+        output
+        for cell in notebook.cells
+        for output in cell.get("outputs", [])
+        if "image/png" in output.get("data", {})
+    ]
+    assert len(shown) == 4
+
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.mark.slow  # recomputes the bounds of all searches of the suites
+def test_the_pages_of_the_leaderboard_are_those_of_its_result_files():
+    spec = importlib.util.spec_from_file_location("leaderboard", DOCS / "leaderboard.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    for name, folder in script.PAGES.items():
+        there = (script.FOLDER / name).read_text(encoding="utf-8")
+        assert script.page(there, folder) == there, "run: python docs/leaderboard.py"
+        assert all(file.stat().st_size < 250_000 for file in script.result_files(script.FOLDER / folder))
+
+
+PAPER = (ROOT / "paper.md").read_text(encoding="utf-8")
+SECTIONS = (
+    "Summary", "Statement of need", "State of the field", "Software design", "Research impact statement",
+    "AI usage disclosure", "Acknowledgements", "References",
+)  # fmt: skip
+"""Sections that the journal asks for, in order."""
+
+
+def test_the_paper_has_the_journals_form_and_cites_what_it_lists():
+    _, head, body = PAPER.split("---\n", 2)
+    about = yaml.safe_load(head)
+    assert {"title", "tags", "authors", "affiliations", "date", "bibliography"} <= about.keys()
+    assert {author["affiliation"] for author in about["authors"]} == {
+        its["index"] for its in about["affiliations"]
+    }
+    assert re.findall(r"^# (.*)$", body, re.M) == list(SECTIONS)
+    assert 750 <= len(body.split()) <= 1750
+    listed = re.findall(r"^@\w+\{(\w+),", (ROOT / about["bibliography"]).read_text(encoding="utf-8"), re.M)
+    assert sorted(listed) == sorted(set(re.findall(r"@(\w+)", body)))
+
+
+def test_addresses_stand_in_one_place():
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"]
+    assert {"Repository", "Documentation", "Issues", "Changelog"} <= urls.keys()
+    files = [*ROOT.glob("*.*"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "parkenv").rglob("*.py")]
+    assert not [file for file in files if file.name != "pyproject.toml" and urls["Repository"] in _text(file)]
+
+
+def _text(file):
+    return file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
+
+
+def test_the_page_of_versions_is_about_those_there_are():
+    page = (ROOT / "docs" / "versions.md").read_text(encoding="utf-8")
+    newest = dict(re.findall(r"^\| `parkenv/(\w+)`.*?\| `-v(\d+)` \|", page, re.M))
+    ids = dict(re.findall(r"parkenv/(\w+)-v(\d+)", " ".join(gym.registry)))
+    assert newest == {"Search": ids["Search"], "Drive": ids["Drive"]}
+    assert f"`{Suite.packaged().name}`" in page
+    assert f"| the package | {parkenv.__version__} |" in page
+    assert f"| result files of the benchmark | {RESULT_VERSION} |" in page
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## (\S+)", changes, re.M)[1] == parkenv.__version__

@@ -1,20 +1,33 @@
-"""Experiments with many cars: settings, measures, summary, figure and command."""
+"""Experiments with many cars: settings, measures, summary; the same cars before and after; report and replay."""
 
+import itertools
 import math
+import shutil
 
 import numpy as np
 import pytest
-from command_line import refused
+from command_line import ran, refused, rows_in, summary_of
+from pictures import shows_color
+from small_lots import driven, features
+from stored_rows import change_rows
+from test_report import data_of
 
-from parkenv import InputError, SearchProblem
+from parkenv import InputError, ParkingLot, SearchProblem, make_scenario, open_run
+from parkenv.cli.report import make_report
 from parkenv.lots import grid_lot
+from parkenv.lots.formats.geojson import write_lot
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import scenario_specs
+from parkenv.show.figures.fleet import KNOWLEDGE_COLORS
 from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.day import Roads, gini, random_order_search_s
-from parkenv.studies.fleet.setting import MEASURES, Setting
+from parkenv.studies.fleet.day_replay import DRIVE, FAIL, QUEUE, choose_days, record_day
+from parkenv.studies.fleet.setting import MEASURES, NOWHERE, Setting
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.fleet.tables import summarize_days
+from parkenv.studies.fleet.tables import CHANGES, summarize_changes, summarize_days
+from parkenv.studies.results import without_nan
+from parkenv.studies.statistics import mean_interval
+from parkenv.studies.study import ExecutionSpec, ReportOptions
 
 
 def experiment(**changes):
@@ -160,3 +173,215 @@ def test_an_agent_that_fails_is_named_and_earlier_days_are_kept(tmp_path):
     assert "SystemExit" in message
     assert "leaving:Failing, own, share 0, 3 cars an hour, day" in message
     assert FleetStudy.table.read(out)
+
+
+HOURS = {"arrivals": {"hours": "08:00-09:00"}, "occupancy": {"typical": {"demand": -0.8}}}
+BEFORE = {"name": "before", "lot": "mini", **HOURS}
+AFTER = {"name": "after", "lot": {"grid": {"rows": 2, "columns": 7}}, **HOURS}
+
+
+def study(*scenarios, **changes):
+    fields = {"arrivals_per_hour": (12.0,), "days": 4, "knows": ("own", "reserve"), "shares": (0.5,)}
+    return FleetStudy(figures=False).changed(scenarios=scenarios, **fields | changes)
+
+
+@pytest.fixture(scope="module")
+def days():
+    both = study(BEFORE, AFTER)
+    return dict(
+        zip([(one.scenario, one.knows) for one in both.fleet_settings], days_of_changes(both), strict=True)
+    )
+
+
+def days_of_changes(study):
+    return [[study.run_day(setting, day) for day in range(study.days)] for setting in study.fleet_settings]
+
+
+def test_a_lot_compared_with_itself_differs_by_exactly_nothing():
+    rows = summarize_changes(days_of_changes(study(BEFORE, BEFORE | {"name": "same"}, days=2)))
+    compared = [row for row in rows if row["change"] == "scenario"]
+    names = [(row["before"], row["after"], row["knows"]) for row in compared]
+    assert names == [("before", "same", knows) for knows in ("own", "reserve")]
+    for row in compared:
+        values = [row[name] for name in CHANGES] + [end for name in CHANGES for end in row[f"{name}_ci95"]]
+        assert {value for value in values if not math.isnan(value)} == {0.0}
+        assert not math.isnan(row["others_change_s"])
+
+
+def test_changes_are_paired_by_day_and_by_car(days):
+    rows = summarize_changes(list(days.values()))
+    (row,) = (r for r in rows if r["change"] == "scenario" and r["knows"] == "reserve")
+    pairs = list(zip(days["after", "reserve"], days["before", "reserve"], strict=True))
+    assert all(one["cars"] == other["cars"] and one["member"] == other["member"] for one, other in pairs)
+    for name, measure in (("change_s", "total_s"), ("search_change_s", "search_s")):
+        expected = mean_interval([one[measure] - other[measure] for one, other in pairs])
+        assert (row[name], *row[f"{name}_ci95"]) == pytest.approx(expected)
+    for group in ("members", "others"):
+        expected = mean_interval([one[f"{group}_s"] - other[f"{group}_s"] for one, other in pairs])
+        assert row[f"{group}_change_s"] == pytest.approx(expected[0], abs=0.01)
+    (row,) = (r for r in rows if r["change"] == "knows" and r["scenario"] == "before")
+    gains, faster = [], []
+    for after, before in zip(days["before", "reserve"], days["before", "own"], strict=True):
+        member = np.array(after["member"].split()) == "1"
+        gained = np.subtract(*(np.array(day["total_cs"].split(), float) for day in (after, before))) / 100.0
+        gains.append(gained[member].mean())
+        faster.append((gained <= -1.0).mean())
+    assert row["members_change_s"] == pytest.approx(np.mean(gains)), "members are compared with themselves"
+    assert row["better_off"] == pytest.approx(np.mean(faster))
+    assert row["better_off"] + row["worse_off"] <= 1.0
+    assert row["before"] == "own observations"
+    assert row["after"] == "reservations for 50 %"
+
+
+def test_only_equal_hours_have_the_same_cars():
+    with pytest.raises(InputError, match=r"arrivals\.hours of 'after' are not those of 'before'"):
+        study(BEFORE, AFTER | {"arrivals": {"hours": "09:00-10:00"}}).check()
+
+
+def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():
+    demand = {
+        "shoppers": {"arrivals_per_hour": (30.0,) * 24, "stay_s": 900.0},
+        "commuters": {"arrivals_per_hour": (15.0,) * 24, "stay_s": 7200.0},
+    }
+    after = {"name": "after", "costs": {"give_up_s": 60.0}}
+    scenarios = BEFORE | {"demand": demand}, BEFORE | after | {"demand": demand}
+    days = days_of_changes(study(*scenarios, knows=("own",), arrivals_per_hour=None))
+    whole, *parts = without_nan(summarize_changes(days, purposes={"before": list(demand)}))
+    assert [row["purpose"] for row in parts] == list(demand)
+    cars, changes = ([row[name] for row in parts] for name in ("cars_a_day", "change_s"))
+    assert sum(cars) == pytest.approx(whole["cars_a_day"])
+    assert np.average(changes, weights=cars) == pytest.approx(whole["change_s"], rel=0.1)
+
+
+def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
+    lot = make_scenario("campus").lot
+    zone = np.where(lot.walk_m() <= np.median(lot.walk_m()), "near", "far")
+    write_lot(ParkingLot(**features(lot) | {"slot_zone": zone}), tmp_path / "zoned.geojson")
+    specs = [
+        {"name": name, "lot": str(tmp_path / "zoned.geojson"), "costs": {"prices": {"near": near, "far": 1.0}}, **HOURS}
+        for name, near in (("before", 1.0), ("after", 1.2))
+    ]  # fmt: skip
+    priced = study(*specs, agents=("greedy-goal",), knows=("own",), arrivals_per_hour=(60.0,), days=3)
+    before, after = days = days_of_changes(priced)
+    prices = {"before": {"far": 1.0, "near": 1.0}, "after": {"far": 1.0, "near": 1.2}}
+    rows = summarize_changes(days, prices)
+    assert [row["zone"] for row in rows] == [None, "far", "near"]
+    whole, *by_zone = rows
+    paid = [[np.array(day["paid_cents"].split(), float).mean() / 100.0 for day in of] for of in days]
+    fleet, _ = priced.fleet(priced.fleet_settings[0])
+    fleet.reset(priced.seed, 0)
+    assert paid[0][0] == pytest.approx(fleet.cars["stay_s"].mean() / 3600.0, abs=0.01), "one price everywhere"
+    assert whole["paid_change"] == pytest.approx(np.mean(np.subtract(*paid[::-1])))
+    assert whole["paid_change"] > 0.0
+    assert sum(row["cars_a_day"] for row in by_zone) == pytest.approx(whole["cars_a_day"])
+    for name in ("parking_cost_change_s", "gave_up_change_s"):
+        measure = name.replace("_change", "")
+        changed = [a[measure] - b[measure] for a, b in zip(after, before, strict=True)]
+        assert whole[name] == pytest.approx(np.mean(changed))
+    assert whole["prices"] == "near 1 → 1.2 an hour"
+    for day in before:
+        day["zone"] = " ".join(["0", *day["zone"].split()[1:]])
+    whole, nowhere, *by_zone = without_nan(summarize_changes(days, prices))
+    assert nowhere["cars_a_day"] == 1.0
+    assert sum(row["cars_a_day"] for row in (nowhere, *by_zone)) == pytest.approx(whole["cars_a_day"])
+    assert nowhere["zone"] == NOWHERE
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("report") / "fleet"
+    done = ran(
+        "fleet", "--scenario", "mini", "--hours", "08:00-08:30", "--arrivals-per-hour", "20,40", "--share", "0.5,1",
+        "--knows", "own,reserve", "-n", 2, "--jobs", 1, "--out", out, "--report",
+    )  # fmt: skip
+    assert (done.stderr, done.stdout.count("reserve ") >= 4) == ("", True)
+    return out
+
+
+def test_the_command_writes_rows_days_and_a_figure(run):
+    assert (len(summary_of(run)["rows"]), len(rows_in(run / "days.csv"))) == (2 * 3, 2 * 2 * 3)
+    assert shows_color(run / "fleet.png", KNOWLEDGE_COLORS["reserve"])
+    assert [path.name for path in open_run(run).figures()] == ["fleet.png"]
+
+
+def test_the_data_replay_the_days_of_the_run(run):
+    data = data_of(run / "report.html")
+    assert data["run"]["title"] == "Many cars on mini"
+    assert len(data["run"]["findings"]) == 1
+    assert len(data["fleets"]) == 8
+    assert all(day["agrees"] for day in data["fleets"])
+    names = ("arrivals_per_hour", "knows", "share")
+    settings = [tuple(day[name] for name in names) for day in data["fleets"] if day["day"] == 0]
+    assert settings == [
+        (a, *kind) for a in (20, 40) for kind in (("own", 0), ("reserve", 0.5), ("reserve", 1))
+    ]
+
+
+def test_cars_drive_along_the_lanes_and_no_slot_holds_two(run):
+    lot = make_scenario("mini").lot
+    edges = {(v, int(t)) for v in range(lot.n_vertices) for t in lot.neighbors[v] if t >= 0}
+    names = ("tracks", "arrival", "ended", "slot", "leaves")
+    for day in data_of(run / "report.html")["fleets"]:
+        occupied = [[] for _ in range(lot.n_slots)]
+        for slot, leaves in zip(day["residents"][::2], day["residents"][1::2], strict=True):
+            occupied[slot].append((0, leaves))
+        for track, arrival, ended, slot, leaves in zip(*(day[name] for name in names), strict=True):
+            assert arrival + sum(track[1::2]) == ended
+            vertices = [track[0], *(code >> 2 for code in track[2::2])]
+            for before, after, code in zip(vertices, vertices[1:], track[2::2], strict=False):
+                kind = code & 3
+                assert (before == after) == (kind != DRIVE)
+                assert kind != DRIVE or (before, after) in edges
+            if slot >= 0:
+                assert vertices[-1] == slot
+                occupied[slot].append((ended, leaves))
+        for stays in occupied:
+            stays.sort()
+            assert all(one[1] <= two[0] for one, two in itertools.pairwise(stays))
+
+
+def test_failed_attempts_and_queues_are_on_the_track():
+    spec = FleetStudy().changed(
+        scenario={"lot": "mini", "arrivals": {"hours": "08:00-08:30"}}, agents=["first-free"], knows=["own"],
+        arrivals_per_hour=[120], days=1, manoeuvre_s=6.0,
+    )  # fmt: skip
+    ((setting, day),) = choose_days(spec, spec.fleet_settings, 1)
+    fleet, agents = spec.fleet(setting)
+    fleet.keep_steps()
+    cars = driven(fleet, 0, 0, agents=agents).cars
+    time_of = {kind: np.zeros(len(cars)) for kind in (FAIL, QUEUE)}
+    for car, track in enumerate(record_day(spec, setting, day, {})["fleet"]["tracks"]):
+        for elapsed, code in zip(track[1::2], track[2::2], strict=True):
+            if code & 3 in time_of:
+                time_of[code & 3][car] += elapsed / 100
+    assert np.allclose(time_of[FAIL], cars["failed_s"], atol=0.1)
+    assert np.allclose(time_of[QUEUE], cars["queued_s"], atol=0.5)
+    assert cars["queued_s"].max() > 0.0
+    assert len(fleet.steps) == (cars["n_steps"] - (cars["slot"] >= 0)).sum()
+    assert (np.diff(fleet.steps["begin"]) >= 0.0).all()
+
+
+def test_days_and_agents_can_be_chosen(run, tmp_path):
+    page = tmp_path / "chosen.html"
+    make_report(run, ExecutionSpec(jobs=1), ReportOptions(numbers=(1,), agents=("greedy-drive",)), out=page)
+    assert [day["day"] for day in data_of(page)["fleets"]] == [1] * 6
+    make_report(run, ExecutionSpec(jobs=1), ReportOptions(episodes=0), out=page)
+    assert data_of(page)["fleets"] == []
+    for options, message in (
+        ({"numbers": (2,)}, "2; .* 0 to 1"),
+        ({"agents": ("belief",)}, "'belief'; known: greedy-drive"),
+    ):
+        with pytest.raises(InputError, match=message):
+            make_report(run, ExecutionSpec(jobs=1), ReportOptions(**options), out=page)
+
+
+def test_a_day_that_differs_is_noted_and_days_with_too_many_cars_are_not_replayed(run, tmp_path, monkeypatch):
+    copy = shutil.copytree(run, tmp_path / "copy")
+    change_rows(copy, lambda row: "total_s" in row and row.update(total_s=1.0))
+    done = ran("report", copy, "--episodes", 1, "--jobs", 1)
+    assert "days.csv says 1.00 s" in " ".join(done.stdout.split())
+    monkeypatch.setattr("parkenv.studies.fleet.day_replay.MOST_CARS", 15)
+    make_report(run, ExecutionSpec(jobs=1), ReportOptions(episodes=1), out=tmp_path / "page.html")
+    data = data_of(tmp_path / "page.html")
+    assert {day["arrivals_per_hour"] for day in data["fleets"]} == {20.0}
+    assert "40 cars an hour" in data["run"]["notes"][0]

@@ -1,19 +1,36 @@
+"""Lots: what they hold and refuse, their generators, and the graph of drives that is made of their lanes."""
+
 import pickle
 import re
 from dataclasses import FrozenInstanceError, fields
 
+import networkx as nx
 import numpy as np
 import pytest
 import shapely
-from lot_checks import refusal
+from hypothesis import given
+from hypothesis import strategies as st
+from lot_checks import DRAGON_LAKE, needs_dragon_lake, refusal
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from scipy.sparse.csgraph import connected_components
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import connected_components, dijkstra
+from small_lots import CAR_PARKS
 
-from parkenv.lots import city_lot, grid_lot, packaged_lot
+from parkenv.errors import InputError
+from parkenv.lots import city_lot, grid_lot, load_lot, packaged_lot
 from parkenv.lots.generators import CROSSING_CLEARANCE, KERB_SIZE, bay_row
 from parkenv.show.figures.lot import draw_lot, save_lot_picture
-from parkenv.world.drive_graph import LANE_OFFSET
+from parkenv.world.drive_graph import (
+    ENTRY_REACH,
+    LANE_OFFSET,
+    NODE_TOLERANCE,
+    SLOT_REACH,
+    VERTEX_SPACING,
+    DriveGraph,
+    GraphError,
+    build_drive_graph,
+)
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 ONE_SLOT = {
@@ -180,3 +197,191 @@ def test_slots_take_one_colour_each():
     draw_lot(lot, ax, slot_color=colors)
     drawn = [c.get_facecolor() for c in ax.collections if isinstance(c, PolyCollection)]
     assert any(np.shape(c) == colors.shape and np.allclose(c, colors) for c in drawn)
+
+
+TWO_WAY, ONE_WAY = False, True
+
+
+def graph_of(lanes, mouths=(), entries=((0.0, 0.0),)) -> DriveGraph:
+    return build_drive_graph(
+        [(np.array(points, dtype=float), oneway, *(speed or (1.0,))) for points, oneway, *speed in lanes],
+        np.array(mouths, dtype=float).reshape(-1, 2),
+        np.array(entries, dtype=float).reshape(-1, 2),
+    )
+
+
+def moves(graph: DriveGraph) -> set[tuple[int, int]]:
+    source, column = np.nonzero(graph.neighbors >= 0)
+    return set(zip(source.tolist(), graph.neighbors[source, column].tolist(), strict=True))
+
+
+def drive_from(lot: ParkingLot, vertex: int) -> np.ndarray:
+    return dijkstra(lot.drive_matrix(), indices=vertex)
+
+
+def test_two_way_lane_keeps_to_the_right_and_turns_at_its_ends():
+    graph = graph_of([([(0, 0), (30, 0)], TWO_WAY)], [(10, -3), (20, -3), (20, 3)])
+    west, east = 3, 4
+    np.testing.assert_allclose(
+        graph.vertex_xy, [(10, -LANE_OFFSET), (20, -LANE_OFFSET), (20, LANE_OFFSET), (0, 0), (30, 0)]
+    )
+    # Along each side and round the ends; and across, between the two slots that face each other.
+    assert moves(graph) == {(west, 0), (0, 1), (1, east), (east, 2), (2, west), (1, 2), (2, 1)}
+    np.testing.assert_allclose(np.cos(graph.vertex_yaw[:3]), [1, 1, -1])
+
+
+def test_edges_have_the_speed_of_their_lane_also_behind_an_entry():
+    lanes = [([(0, 0), (30, 0)], TWO_WAY, 2.0), ([(30, 0), (60, 0)], TWO_WAY)]
+    graph = graph_of(lanes, [(10, -3), (10, 3), (50, -3)], entries=((20.0, 0.0),))
+    for vertex, row in enumerate(graph.neighbors.tolist()):
+        for column, target in enumerate(row):
+            ends = graph.vertex_xy[[vertex, target], 0]
+            fast = target >= 0 and ends.mean() < 30.0
+            assert graph.edge_speed[vertex, column] == (2.0 if fast else 1.0)
+
+
+def test_one_way_lane_is_one_chain_that_serves_both_sides():
+    graph = graph_of([([(0, 0), (30, 0)], ONE_WAY)], [(20, 3), (10, -3), (15, 3)])
+    assert moves(graph) == {(3, 1), (1, 2), (2, 0), (0, 4)}
+    np.testing.assert_allclose(graph.vertex_xy[:3, 1], 0.0)
+
+
+def test_lane_bends_do_not_shorten_the_way():
+    graph = graph_of([([(0, 0), (10, 0), (10, 10)], ONE_WAY)], [(5, -2), (12, 5)])
+    assert graph.edge_length[0, graph.neighbors[0] == 1].item() == pytest.approx(10.0)
+    assert graph.vertex_yaw[1] == pytest.approx(np.pi / 2)
+
+
+@given(
+    stations=st.lists(st.floats(-5.0, 45.0), min_size=1, max_size=70),
+    sides=st.lists(st.booleans(), min_size=70, max_size=70),
+    oneway=st.booleans(),
+)
+def test_vertices_keep_their_distance(stations, sides, oneway):
+    mouths = [(x, 3.0 if left else -3.0) for x, left in zip(stations, sides, strict=False)]
+    graph = graph_of([([(0, 0), (40, 0)], oneway)], mouths)
+    length = graph.edge_length[graph.neighbors >= 0]
+    assert length.min() > 0.0
+    for left in (True, False):
+        chain = [oneway or (y > 0) == left for _, y in mouths]
+        along = np.sort(graph.vertex_xy[: len(mouths), 0][chain])
+        gap = min(VERTEX_SPACING, 40.0 / (len(along) + 1))
+        assert (np.diff(np.r_[0.0, along, 40.0]) >= gap - 1e-6).all()
+
+
+def test_vertices_that_have_room_stay_before_their_slots():
+    stations = np.arange(1.25, 39.0, 2.5)
+    graph = graph_of([([(0, 0), (40, 0)], TWO_WAY)], [(x, -3.0) for x in stations])
+    np.testing.assert_allclose(graph.vertex_xy[: len(stations), 0], stations)
+
+
+def test_loop_lane_can_be_driven_round():
+    ring = [(0, 0), (30, 0), (30, 20), (0, 20), (0, 0)]
+    graph = graph_of([(ring, ONE_WAY)], [(15, -3), (15, 23)])
+    g = nx.DiGraph(sorted(moves(graph)))
+    assert nx.is_strongly_connected(g)
+    assert not any(i == j for i, j in moves(graph))
+    total = sum(graph.edge_length[graph.neighbors >= 0])
+    assert total == pytest.approx(100.0)
+
+
+def test_lane_out_and_back_to_a_junction_is_no_edge_to_itself():
+    graph = graph_of([([(-20, 0), (0, 0)], TWO_WAY), ([(0, 0), (10, 5), (10, -5), (0, 0)], TWO_WAY)])
+    assert not any(i == j for i, j in moves(graph))
+    assert nx.is_strongly_connected(nx.DiGraph(sorted(moves(graph))))
+
+
+def test_entry_in_the_middle_of_a_lane_becomes_a_junction():
+    graph = graph_of([([(0, 0), (40, 0)], TWO_WAY)], [(10, -3), (30, -3)], entries=[(20, 6)])
+    entry = graph.entry_vertices[0]
+    np.testing.assert_allclose(graph.vertex_xy[entry], (20, 0))
+    assert {(0, entry), (entry, 1)} <= moves(graph)
+    assert entry >= 2
+
+
+def test_points_closer_than_the_tolerance_are_one_junction_wherever_they_lie():
+    # 0.0005 m is where rounding to the tolerance would part the two points.
+    near = 0.0005
+    lanes = [([(-20, 0), (near - 1e-9, 0)], TWO_WAY), ([(near + 1e-9, 0), (20, 0)], TWO_WAY)]
+    graph = graph_of(lanes, entries=[(-20, 0)])
+    assert len(graph.vertex_xy) == 3
+    apart = graph_of([lanes[0], ([(3 * NODE_TOLERANCE, 0), (20, 0)], TWO_WAY)], entries=[(-20, 0)])
+    assert len(apart.vertex_xy) == 4
+
+
+@given(bearings=st.lists(st.floats(0.0, 2 * np.pi), min_size=1, max_size=4, unique_by=lambda b: round(b, 2)))
+def test_columns_are_the_best_assignment_of_bearings(bearings):
+    ends = 50.0 * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    graph = graph_of([([(0, 0), tuple(end)], TWO_WAY) for end in ends], entries=[(0, 0)])
+    hub = graph.entry_vertices[0]
+    wanted = np.array([np.pi / 2, -np.pi / 2, np.pi, 0.0])
+    misfit = 1.0 - np.cos(np.array(bearings)[:, None] - wanted)
+    used = np.flatnonzero(graph.neighbors[hub] >= 0)
+    assert len(used) == len(bearings)
+    spot = graph.vertex_xy[graph.neighbors[hub, used]]
+    got = (1.0 - np.cos(np.arctan2(spot[:, 1], spot[:, 0]) - wanted[used])).sum()
+    assert got == pytest.approx(misfit[linear_sum_assignment(misfit)].sum(), abs=1e-9)
+
+
+def test_five_lanes_out_of_one_junction_are_refused():
+    angles = np.arange(5) * 2 * np.pi / 5
+    with pytest.raises(GraphError, match=r"junction .* has 5 lanes that lead away") as caught:
+        graph_of([([(0, 0), (50 * np.cos(a), 50 * np.sin(a))], TWO_WAY) for a in angles])
+    np.testing.assert_allclose(caught.value.problems[0].xy, (0, 0))
+    # Five that meet are fine as long as four lead away.
+    graph_of([([(50 * np.cos(a), 50 * np.sin(a)), (0, 0)], a == 0.0) for a in angles])
+
+
+def test_what_no_lane_serves_is_listed():
+    lane = [([(0, 0), (40, 0)], TWO_WAY)]
+    with pytest.raises(GraphError, match="slot 1: is on no lane") as caught:
+        graph_of(lane, [(10, -3), (10, SLOT_REACH + 1), (20, -30)])
+    assert [(p.kind, p.index) for p in caught.value.problems] == [("slot", 1), ("slot", 2)]
+    with pytest.raises(GraphError, match=r"entry 0: is 20\.0 m from the nearest lane"):
+        graph_of(lane, entries=[(10, ENTRY_REACH + 5)])
+    assert issubclass(GraphError, InputError)
+
+
+@given(rows=st.integers(1, 7), columns=st.integers(1, 9))
+def test_grids_are_strongly_connected_and_their_matrix_is_their_graph(rows, columns):
+    lot = grid_lot(rows, columns)
+    matrix = lot.drive_matrix()
+    assert connected_components(matrix, connection="strong")[0] == 1
+    source, column = np.nonzero(lot.neighbors >= 0)
+    dense = np.full((lot.n_vertices, lot.n_vertices), np.inf)
+    np.minimum.at(dense, (source, lot.neighbors[source, column]), lot.edge_length[source, column])
+    np.testing.assert_array_equal(np.where(np.isinf(dense), 0.0, dense), matrix.toarray())
+    assert (lot.edge_length[lot.neighbors < 0] == 0.0).all()
+
+
+@pytest.mark.parametrize("name", [*CAR_PARKS, pytest.param(DRAGON_LAKE, marks=needs_dragon_lake)])
+def test_known_lots_are_driven_on_lanes_only(name):
+    lot = load_lot(name)
+    assert connected_components(lot.drive_matrix(), connection="strong")[0] == 1
+    source, column = np.nonzero(lot.neighbors >= 0)
+    ways = np.stack([lot.vertex_xy[source], lot.vertex_xy[lot.neighbors[source, column]]], axis=1)
+    slots = shapely.STRtree(shapely.polygons(lot.slot_corners()))
+    assert slots.query(shapely.linestrings(ways), predicate="intersects").shape == (2, 0)
+
+
+def test_from_aisle_to_aisle_the_way_is_round_the_end_of_the_rows():
+    lot = grid_lot(4, 10)
+    back_to_back = [lot.slot_ids.index(name) for name in ("1-4", "2-4")]
+    assert np.hypot(*(lot.slot_xy[back_to_back[0]] - lot.slot_xy[back_to_back[1]])) == pytest.approx(5.0)
+    assert drive_from(lot, back_to_back[0])[back_to_back[1]] > 16.0 + 2 * 4 * 2.5
+
+
+def test_street_of_kerbside_slots_runs_as_traffic_does():
+    slots = {
+        "slot_ids": ("right", "left"),
+        "slot_xy": [[20.0, -3.0], [40.0, 3.0]],
+        "slot_yaw": [0.0, 0.0],
+        "slot_length": [6.0, 6.0],
+        "slot_width": [2.1, 2.1],
+        "slot_mouth": [Mouth.LEFT, Mouth.RIGHT],
+    }
+    lanes = (Lane([[0.0, 0.0], [60.0, 0.0]], oneway=True),)
+    lot = ParkingLot(**ONE_SLOT | slots | {"lanes": lanes})
+    np.testing.assert_allclose(lot.mouth_xy(), [[20.0, -1.95], [40.0, 1.95]])
+    assert drive_from(lot, 0)[1] == pytest.approx(20.0)
+    assert np.isinf(drive_from(lot, 1)[0])

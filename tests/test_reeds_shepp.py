@@ -1,13 +1,26 @@
-"""Reeds-Shepp words against what they must be: ways to the goal, symmetric, and never longer than another way."""
+"""The car that drives and the shortest ways of such a car: closed forms, limits, symmetry; what it touches."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv.driving.vehicle import move_along
+from parkenv import InputError
+from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
+from parkenv.driving.vehicle import (
+    ACCELERATION,
+    PHYSICS_S,
+    SPEED,
+    STEERING,
+    VehicleParameters,
+    X,
+    Y,
+    advance,
+    move_along,
+)
 from planners.driving.reeds_shepp import (
     LEFT,
     MOST_WORDS,
@@ -105,3 +118,153 @@ def test_changes_of_direction_are_avoided_where_they_cost():
     assert changes[0] < changes[1]
     assert np.abs(costly).sum() > np.abs(cheap).sum()
     assert word_cost(np.array([1.0, -1.0, 0.0, 0.0, 0.0]), 2, 2.0, 3.0) == 7.0
+
+
+CAR = VehicleParameters()
+commands = st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)), min_size=1, max_size=60)
+
+
+def drive(car, state, acceleration, steering, steps=1):
+    """The states under a constant command, one a step."""
+    states = [np.array(state, dtype=float)]
+    for _ in range(steps):
+        states.append(states[-1].copy())
+        advance(states[-1], acceleration, steering, car.limits)
+    return np.array(states)
+
+
+def driven(pairs, speed=0.0):
+    """The states that a row of commands leads through, one a step."""
+    states = [np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])]
+    for acceleration, steering in pairs:
+        states.append(drive(CAR, states[-1], acceleration, steering)[-1])
+    return np.array(states)
+
+
+@given(steering=st.floats(0.05, 1.0), speed=st.floats(0.2, 3.0), side=st.sampled_from([-1.0, 1.0]))
+def test_the_rear_axle_runs_on_a_circle_of_wheelbase_over_tan_steering(steering, speed, side):
+    angle = side * steering * CAR.max_steering
+    radius = CAR.wheelbase / math.tan(angle)
+    path = drive(CAR, [0.0, 0.0, 0.0, speed, angle, 0.0], 0.0, side * steering, steps=400)
+    away = np.hypot(path[:, X], path[:, Y] - radius)
+    np.testing.assert_allclose(away, abs(radius), rtol=1e-9)
+    assert np.allclose(path[:, SPEED], speed)
+
+
+@given(steering=st.floats(-1.0, 1.0), steps=st.integers(1, 200))
+def test_a_car_at_rest_stays_where_it_is(steering, steps):
+    """Turning the wheels moves nothing."""
+    path = drive(CAR, np.array([3.0, -2.0, 0.7, 0.0, 0.0, 0.0]), 0.0, steering, steps)
+    assert (path[:, : SPEED + 1] == path[0, : SPEED + 1]).all()
+
+
+@given(pairs=commands)
+def test_all_limits_and_rates_are_kept(pairs):
+    states = driven(pairs)
+    change = np.abs(np.diff(states, axis=0))
+    assert np.abs(states[:, STEERING]).max() <= CAR.max_steering
+    assert change[:, STEERING].max() <= CAR.steering_rate * PHYSICS_S + 1e-12
+    assert -CAR.max_reverse_speed <= states[:, SPEED].min() <= states[:, SPEED].max() <= CAR.max_speed
+    assert change[:, SPEED].max() <= CAR.max_braking * PHYSICS_S + 1e-12
+    faster = np.abs(states[1:, SPEED]) > np.abs(states[:-1, SPEED]) + 1e-12
+    assert (change[faster, SPEED] <= CAR.max_acceleration * PHYSICS_S + 1e-12).all()
+    # Only coming to rest and meeting a limit of the speed end an acceleration at once.
+    held = states[:, ACCELERATION]
+    ended = held[1:] == 0.0
+    assert (np.abs(np.diff(held))[~ended] <= CAR.acceleration_rate * PHYSICS_S + 1e-9).all()
+
+
+@given(speed=st.floats(0.01, 8.0) | st.floats(-3.0, -0.01), brake=st.floats(0.05, 1.0))
+def test_brakes_take_energy_bring_the_car_to_rest_and_hold_it(speed, brake):
+    path = drive(CAR, [0.0, 0.0, 0.0, speed, 0.0, 0.0], -math.copysign(brake, speed), 0.0, steps=1)
+    states = [path[-1]]
+    while states[-1][SPEED] != 0.0:
+        states.append(drive(CAR, states[-1], -math.copysign(brake, speed), 0.0)[-1])
+        assert abs(states[-1][SPEED]) < abs(states[-2][SPEED])
+        assert states[-1][SPEED] * speed >= 0.0
+    assert np.ptp(drive(CAR, states[-1], 0.0, 0.0, steps=10)[:, X]) == 0.0
+
+
+def test_the_way_to_a_halt_is_that_of_constant_braking():
+    soft = replace(CAR, acceleration_rate=1e6)
+    state = np.array([0.0, 0.0, 0.0, 5.0, 0.0, 0.0])
+    while state[SPEED] > 0.0:
+        advance(state, -1.0, 0.0, soft.limits)
+    assert state[X] == pytest.approx(5.0**2 / (2 * soft.max_braking), rel=1e-12)
+
+
+@given(pairs=commands, speed=st.floats(-3.0, 3.0))
+def test_left_and_right_are_mirror_images(pairs, speed):
+    left, right = driven(pairs, speed), driven([(a, -s) for a, s in pairs], speed)
+    np.testing.assert_array_equal(left * [1, -1, -1, 1, -1, 1], right)
+
+
+@given(curvature=st.floats(-0.3, 0.3), way=st.floats(-4.0, 4.0), pieces=st.integers(2, 20))
+def test_an_arc_in_pieces_is_the_same_arc(curvature, way, pieces):
+    """Exact integration: the step's length makes no difference."""
+    there = (1.0, 2.0, 0.5)
+    for _ in range(pieces):
+        there = move_along(*there, curvature, way / pieces)
+    np.testing.assert_allclose(there, move_along(1.0, 2.0, 0.5, curvature, way), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"length": 0.0}, "vehicle: length is 0.0, want a number above 0"),
+        ({"width": float("nan")}, "vehicle: width is nan"),
+        ({"wheelbase": 4.0}, "want both within the length"),
+        ({"max_steering": 1.6}, "below a right angle"),
+        ({"max_speed": 50.0}, "half a length in a step"),
+    ],
+)
+def test_a_car_that_cannot_be_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(CAR, **change)
+
+
+@given(
+    speed=st.floats(0.5, CAR.max_speed),
+    offset=st.floats(-0.85, 0.85),
+    phase=st.floats(0.0, 1.0),
+    angle=st.floats(-1.2, 1.2),
+)
+@settings(max_examples=60)
+def test_nothing_is_passed_through_at_any_allowed_speed(speed, offset, phase, angle):
+    """A wall of no thickness and a pole across the way are touched, wherever a step ends."""
+    along = np.array([math.sin(angle), math.cos(angle)])
+    at = np.array([12.0 + phase, offset])
+    wall = np.stack([at - 0.05 * along, at + 0.05 * along])
+    space = CollisionWorld(CAR, Obstacles.of([(ObstacleKind.WALL, wall)]))
+    state = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
+    while state[X] < 20.0:
+        advance(state, 0.0, 0.0, CAR.limits)
+        if space.touched(*state[:3]):
+            break
+    assert state[X] + CAR.length - CAR.rear_overhang >= 12.0 - 0.05
+    assert state[X] < 12.5
+
+
+@pytest.mark.parametrize("thing", [t for t in ObstacleKind if t is not ObstacleKind.NOTHING])
+def test_what_is_touched_is_named(thing):
+    outline = np.array([[6.0, -1.0], [7.0, -1.0], [7.0, 1.0], [6.0, 1.0]])
+    if thing in (ObstacleKind.MOVING_CAR, ObstacleKind.PEDESTRIAN):
+        space = CollisionWorld(CAR, Obstacles.of([]), [(thing, outline - [6.5, 0.0])])
+        space.move([[30.0, 0.0, 0.0]])
+        assert space.touched(0.0, 0.0, 0.0) == ObstacleKind.NOTHING
+        space.move([[4.0, 0.0, 0.3]])
+        assert space.touched(0.0, 0.0, 0.0) == thing
+    else:
+        is_line = thing in (ObstacleKind.KERB, ObstacleKind.WALL)
+        line = outline[:2] + np.array([0.0, 0.9]) if is_line else outline
+        space = CollisionWorld(CAR, Obstacles.of([(thing, line)]))
+        assert space.touched(0.0, 1.5, 0.0) == ObstacleKind.NOTHING
+        assert space.touched(3.0, 0.0, 0.0) == thing
+        assert space.touched(0.0, 1.5, 0.0) == ObstacleKind.NOTHING
+
+
+def test_of_several_things_the_same_one_is_named_in_any_order():
+    car = (ObstacleKind.PARKED_CAR, np.array([[3.0, -1.0], [4.0, -1.0], [4.0, 1.0], [3.0, 1.0]]))
+    kerb = (ObstacleKind.KERB, np.array([[3.0, -1.0], [3.0, 1.0]]))
+    for things in ([car, kerb], [kerb, car]):
+        assert CollisionWorld(CAR, Obstacles.of(things)).touched(0.0, 0.0, 0.0) == ObstacleKind.PARKED_CAR

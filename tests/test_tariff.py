@@ -1,27 +1,36 @@
-"""Prices of zones: what parking costs a driver, in single searches and in fleets, and what a city reads of it."""
+"""What parking costs, by zones and slots, for solvers, agents and fleets; the terms of a step add up everywhere."""
 
+import json
 import pickle
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import parkenv as command
 from command_line import rows_in
-from small_lots import driven, features
+from gymnasium.vector import AutoresetMode
+from small_lots import driven, features, lasting
 
-from parkenv import InputError, ParkingLot, fleet, make_scenario
+from parkenv import InputError, OccupancyProcess, ParkingLot, fleet, lot_v0, make_scenario, simulate
 from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.engine.records import CAR, N_TERMS, SEARCH
+from parkenv.envs.sb3 import SearchVecEnv
+from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import AgentsByStay, policy_of
-from parkenv.world.cost_terms import COST_FIELDS
+from parkenv.studies.trips.driven_search import DrivenSearch
+from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS, METRICS, REWARD_TERMS
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways
-from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.scenario import drive_times
 from parkenv.world.tariff import NO_ZONE, Hours, Price, Tariff, Zone
 from planners import make_agent
+from planners.bounds.oracle import best_slot
 from planners.heuristics import POLICIES
+from planners.routes import DriveRoutes
 
 
 def zoned(lot, far="", **columns):
@@ -176,3 +185,205 @@ def test_prices_by_hours_are_a_tariff():
         Price(1.0, hourly=zone.price.hourly)
     with pytest.raises(InputError, match="price"):
         Tariff({"near": "cheap"})
+
+
+DEAR_S = 600.0
+
+
+def empty_lot(lot):
+    return lasting(lot, np.zeros(lot.n_slots, bool), said=-0.5)
+
+
+def parked_at(name, scenario):
+    row = EpisodeRunner(scenario, name, make_agent(name, scenario)).run(0).row
+    return scenario.lot.slot_ids.index(row["slot"])
+
+
+def priced(lot, cost_s):
+    return ParkingLot(**{**features(lot), "slot_parking_cost_s": cost_s})
+
+
+@pytest.mark.parametrize(
+    "name",
+    "mdp mdp-static mdp-tuned belief exact oracle greedy-goal greedy-total first-free".split(),
+)
+def test_agents_park_elsewhere_where_that_pays(name):
+    lot = packaged_lot("mini")
+    plain = empty_lot(lot)
+    chosen = parked_at(name, plain)
+    # The chosen half of the lot is expensive.
+    walk_m = lot.walk_m()
+    near = walk_m <= np.median(walk_m) if walk_m[chosen] <= np.median(walk_m) else walk_m > np.median(walk_m)
+    dear = empty_lot(priced(lot, np.where(near, DEAR_S, 0.0)))
+    assert not near[parked_at(name, dear)]
+    # The same price for all slots changes nothing.
+    alike = empty_lot(priced(lot, np.full(lot.n_slots, DEAR_S)))
+    assert parked_at(name, alike) == chosen
+
+
+def test_the_bound_counts_prices():
+    rng = np.random.default_rng(4)
+    lot = packaged_lot("campus")
+    scenario = replace(
+        empty_lot(priced(lot, rng.uniform(0.0, 120.0, lot.n_slots))),
+        occupancy=OccupancyProcess.from_demand(np.full(lot.n_slots, 2.0), np.zeros(168), 600.0),
+    )
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    for seed in range(5):
+        env.reset(seed=seed)
+        state = env.unwrapped.state
+        routes = DriveRoutes(scenario)
+        drive_s = routes.seconds_from(state.vertex)[: lot.n_slots]
+        free_at = [float(state.world.next_free([s], state.time + d)[0]) for s, d in enumerate(drive_s)]
+        total_s = np.array(free_at) - state.time + scenario.walk_s + scenario.lot.slot_parking_cost_s
+        best = best_slot(scenario, routes, state.world, state.vertex, state.time)
+        assert best.total_s == pytest.approx(total_s.min())
+        # The oracle waits in whole steps.
+        reached_s = simulate(env, make_agent("oracle", scenario), seed).info["total_s"]
+        assert best.total_s - 1e-6 <= reached_s <= best.total_s + 2 * scenario.wait_s
+
+
+def test_a_comparison_shows_what_parking_cost(tmp_path):
+    lot = packaged_lot("mini")
+    write_lot(priced(lot, np.where(np.arange(lot.n_slots) % 2 == 0, 30.0, 5.0)), tmp_path / "dear.geojson")
+    done = command(
+        "compare", "--lot", tmp_path / "dear.geojson", "--agents", "mdp,greedy-goal", "--episodes", 5,
+        "--day-error", 0, "--occupancy-levels", "none", "--no-figures", "--out", tmp_path / "run",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "parking" in done.stdout
+    for row in json.loads((tmp_path / "run" / "summary.json").read_text())["rows"]:
+        assert 4.0 < row["parking_cost_s"] <= 30.0
+        assert row["total_s"] == pytest.approx(sum(row[name] for name in COST_FIELDS))
+
+
+SLOT_S, ZONE_S = 15.0, 30.0  # of parking: of the slot itself, and of an hour in its zone
+PRICE_S = SLOT_S + ZONE_S  # of a search, which is for the expected stay of an hour
+LIMIT = 60
+
+
+@pytest.fixture(scope="module")
+def costly():
+    """A lot where every slot has a cost, its zone a price, and where a failed attempt is likely."""
+    plain = make_scenario("mini")
+    lot = ParkingLot(**features(plain.lot) | {"slot_parking_cost_s": np.full(plain.lot.n_slots, SLOT_S)})
+    tariff = Tariff({"other": 12.0 * ZONE_S / 3600.0})
+    return replace(plain, lot=lot, failure_s=7.0, tariff=tariff, value_of_time=12.0)
+
+
+def check_sums(info, parked=True, of_many=False):
+    """The terms of an episode, as `info` names them, are its total; of many cars each pays for its own stay."""
+    assert set(METRICS) <= set(info)
+    assert sum(info[name] for name in COST_FIELDS) == pytest.approx(info["total_s"])
+    if parked:
+        assert info["parked"]
+        paid_s = info["parking_cost_s"]
+        assert paid_s > SLOT_S if of_many else paid_s == pytest.approx(PRICE_S)
+
+
+def check_step(reward, info):
+    """The terms of a step are its reward."""
+    assert sum(info[name] for name in REWARD_TERMS) == pytest.approx(reward)
+
+
+def tries(mask, rng):
+    """A random action that the graph has, mostly parking where there is a slot."""
+    return 4 if mask[4] and rng.random() < 0.7 else int(rng.choice(np.nonzero(mask)[0]))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "searches"),
+    [
+        ("Search-v2", {}, 3),
+        ("SearchSensors-v2", {"observation": "scan"}, 3),
+        pytest.param("SearchPerception-v2", {"captures": 1, "picture_width": 160}, 1, marks=pytest.mark.slow),
+    ],
+)
+def test_single_searches(costly, name, options, searches):
+    env = gym.make(f"parkenv/{name}", scenario=costly, **options)
+    rng, seen = np.random.default_rng(0), set()
+    for seed in range(searches):
+        observation, _ = env.reset(seed=seed)
+        returned, over, sums = 0.0, False, dict.fromkeys(REWARD_TERMS, 0.0)
+        while not over:
+            observation, reward, terminated, truncated, info = env.step(
+                tries(observation["action_mask"], rng)
+            )
+            check_step(reward, info)
+            check_sums(info, parked=bool(terminated and info["parked"]))
+            returned, over = returned + reward, terminated or truncated
+            sums = {term: sums[term] - info[term] for term in REWARD_TERMS}
+        assert info["total_s"] == pytest.approx(-returned)
+        for term in COST_TERMS:
+            assert info[term.field] == pytest.approx(sums[f"reward_{term.name}"])
+        seen |= {term.name for term in COST_TERMS if info[term.field]}
+    assert {"drive", "walk", "parking"} <= seen
+
+
+def test_the_batch(costly):
+    envs = ParkSearchVectorEnv(8, costly, max_episode_steps=LIMIT, autoreset_mode=AutoresetMode.SAME_STEP)
+    observations, _ = envs.reset(seed=0)
+    rng, returns, ended = np.random.default_rng(0), np.zeros(8), 0
+    for _ in range(200):
+        actions = np.array([tries(mask, rng) for mask in observations["action_mask"]])
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        returns += rewards
+        done = terminated | truncated
+        for i in np.flatnonzero(done):
+            final = {name: infos["final_info"][name][i] for name in METRICS}
+            check_sums(final, parked=bool(final["parked"]))
+            terms = infos["final_info"]
+            assert sum(terms[name][i] for name in REWARD_TERMS) == pytest.approx(rewards[i])
+            assert final["total_s"] == pytest.approx(-returns[i])
+            ended += int(final["parked"])
+        returns[done] = 0.0
+    assert ended > 10
+
+
+def test_stable_baselines3(costly):
+    venv = SearchVecEnv(4, costly, max_episode_steps=LIMIT)
+    venv.seed(0)
+    venv.reset()
+    rng, ended = np.random.default_rng(0), 0
+    for _ in range(200):
+        actions = np.array([tries(mask, rng) for mask in venv.action_masks()])
+        _, _, done, infos = venv.step(actions)
+        for i in np.flatnonzero(done):
+            check_sums(infos[i], parked=infos[i]["parked"])
+            assert infos[i]["episode"]["r"] == pytest.approx(-infos[i]["total_s"])
+            ended += int(infos[i]["parked"])
+    assert ended > 10
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_many_cars_as_agents(costly):
+    env = lot_v0.env(scenario=costly, cars=6)
+    env.reset(seed=0)
+    rng, returns, parked = np.random.default_rng(0), {}, 0
+    for car in env.agent_iter():
+        observation, _, terminated, truncated, info = env.last()
+        if info:
+            returns[car] = returns.get(car, 0.0) + sum(info[name] for name in REWARD_TERMS)
+            check_sums(info, parked=info["parked"], of_many=True)
+        if terminated or truncated:
+            assert info["total_s"] == pytest.approx(-returns[car])
+            parked += int(info["parked"])
+            env.step(None)
+        else:
+            env.step(tries(observation["action_mask"], rng))
+    assert parked > 0
+
+
+def test_driven_trips(costly):
+    trip = DrivenSearch(costly).run(seed=1)
+    assert trip.parked
+    assert trip.costs["parking_cost_s"] == pytest.approx(PRICE_S)
+    assert set(trip.costs) == set(COST_FIELDS) - {"drive_s"}
+    assert trip.total_s == pytest.approx(trip.lanes_s + trip.manoeuvre_s + sum(trip.costs.values()))
+
+
+@pytest.mark.parametrize("record", [SEARCH, CAR])
+def test_records_hold_every_term_in_order(record):
+    one = np.zeros(1, record)
+    one["costs"] = np.arange(N_TERMS) + 1.0
+    assert [one[name][0] for name in COST_FIELDS] == [i + 1.0 for i in range(N_TERMS)]
