@@ -177,7 +177,11 @@ def test_all_meet_the_same_worlds_nobody_beats_the_bound_and_the_oracle_reaches_
     assert len(worlds) == 4
 
 
-def test_the_oracle_waits_for_a_slot_that_is_about_to_come_free():
+def test_the_oracle_must_be_shown_the_future_and_waits_for_a_slot_that_is_about_to_come_free():
+    scenario = make_scenario("mini")
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    with pytest.raises(RuntimeError, match="prepare"):
+        make_agent("oracle", scenario).predict(env.reset(seed=0)[0])
     # Days that are as forecast: on a much fuller one, slots are free for less than the oracle's step of waiting.
     scenario = make_scenario("mini", entry=0, day_error=0.0)
     busy = scenario.replace(occupancy=scenario.occupancy.at_mean_occupancy(0.97, 10 * 3600.0))
@@ -187,13 +191,6 @@ def test_the_oracle_waits_for_a_slot_that_is_about_to_come_free():
     assert waited, "in a nearly full lot it must wait in some episode"
     for row in parked:
         assert row["bound_s"] - 1e-6 <= row["total_s"] <= row["bound_s"] + 5 * busy.wait_s
-
-
-def test_the_oracle_must_be_shown_the_future():
-    scenario = make_scenario("mini")
-    env = gym.make("parkenv/Search-v2", scenario=scenario)
-    with pytest.raises(RuntimeError, match="prepare"):
-        make_agent("oracle", scenario).predict(env.reset(seed=0)[0])
 
 
 def test_the_oracle_turns_to_a_slot_where_the_lot_cannot_be_proven_full():

@@ -129,30 +129,22 @@ def within(module, packages):
     return any(module == package or module.startswith(f"{package}.") for package in packages)
 
 
-def test_sensors_know_nothing_of_parking():
+def test_packages_import_those_below_them_only():
     assert not offenders(
         "sim_sensors",
         lambda _, module: (
             within(module, ("parkenv", "planners")) and not within(module, ("parkenv.compiled",))
         ),
     )
-
-
-def test_planners_see_the_lot_the_belief_and_the_problem_only():
     assert not offenders(
         "planners",
         lambda _, module: within(module, ("parkenv",)) and not within(module, PLANNERS_MAY_SEE),
     )
-
-
-def test_the_world_never_imports_a_planner():
     assert not offenders(
         "parkenv",
         lambda path, module: within(module, ("planners",)) and path.parts[0] not in MAY_SEE_PLANNERS,
     )
 
-
-def test_packages_import_those_below_them_only():
     def points_up(path, module):
         here = {"lot_v0": "envs"}.get(path.parts[0], path.parts[0])  # named as PettingZoo's environments are
         if here not in LAYERS or not module.startswith("parkenv."):
@@ -176,11 +168,8 @@ def test_parkenv_holds_nothing_but_its_layers():
     assert entries == (set(LAYERS) - modules) | files
 
 
-def test_no_modules_import_each_other_in_a_circle():
+def test_neither_modules_nor_folders_import_each_other_in_a_circle():
     TopologicalSorter(import_graph(ROOT)).prepare()  # raises CycleError, which names the modules
-
-
-def test_no_folders_import_each_other_in_a_circle():
     TopologicalSorter(folder_graph(ROOT)).prepare()
 
 

@@ -33,7 +33,7 @@ def actions(agent, scenario, seed):
     return chosen
 
 
-def test_without_rivals_it_is_belief_action_for_action():
+def test_without_rivals_it_is_belief_and_equal_seeds_give_equal_actions_in_batches_too():
     scenario = make_scenario("mini")
     belief, nobody = (
         make_agent("belief", scenario),
@@ -41,10 +41,6 @@ def test_without_rivals_it_is_belief_action_for_action():
     )
     for seed in range(3):
         assert actions(belief, scenario, seed) == actions(nobody, scenario, seed)
-
-
-def test_equal_seeds_give_equal_actions_and_batches_are_single_predictions():
-    scenario = make_scenario("mini")
     agent = make_agent("belief-rivals", scenario)
     assert actions(agent, scenario, 3) == actions(make_agent("belief-rivals", scenario), scenario, 3)
     observations = [gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=seed)[0] for seed in range(4)]

@@ -233,16 +233,13 @@ def test_camera_frame_is_right_down_forward_and_a_right_camera_stands_to_the_rig
     assert camera_pose(0.0, 0.0, 1.0, 0.0, roll=0.2)[2, 0] < 0.0
 
 
-def test_exposure_holds_its_limits():
+def test_exposure_holds_its_limits_and_noise_has_the_stated_deviation():
     sensor = ImageSensor(least_gain=0.5, greatest_gain=2.0)
     dark, bright, flat = (np.full((64, 64, 3), light, dtype=np.float32) for light in (1e-4, 50.0, 0.19))
     assert [sensor.gain(light) for light in (dark, bright, flat)] == [2.0, 0.5, pytest.approx(1.0)]
     quiet = ImageSensor(shot_noise=0.0, read_noise=0.0, vignetting=0.0)
     # 0.19 linear is 0.473 under the sRGB curve.
     assert np.unique(quiet.expose(flat, 0, 1.0)).tolist() == [121]
-
-
-def test_noise_has_the_stated_deviation():
     sensor = ImageSensor(vignetting=0.0, blur=0.0)
     image = sensor.expose(np.full((200, 200, 3), 0.19, dtype=np.float32), 5, 1.0).astype(float)
     slope = 255.0 * 1.055 / 2.4 * 0.19 ** (1.0 / 2.4 - 1.0)

@@ -90,9 +90,12 @@ def test_a_number_out_of_its_range_is_refused_by_every_command(entry):
                 spec_of(option.model, {option.name: str(bounds[0] - 1)})
 
 
-def test_names_are_those_of_the_modules_behind_them():
+def test_names_are_those_of_the_modules_behind_them_and_listed_in_help():
     assert tuple(PRESETS) == WEATHERS
     assert set(RigName.__args__) == set(RIG_NAMES)
+    page = parkenv("compare", "--help").stdout.replace("\n", " ")
+    for name in (*AGENTS, *SCENARIO_NAMES):
+        assert name in re.sub(r"- +", "-", page)
 
 
 REFUSALS = [
@@ -172,12 +175,6 @@ def test_version_and_help_load_nothing_large(answers):
     assert {line.split()[0] for line in page if line.startswith("  ")} >= {"demo", "compare", "lot", "schema"}
 
 
-def test_agents_and_scenarios_are_listed_in_help():
-    page = parkenv("compare", "--help").stdout.replace("\n", " ")
-    for name in (*AGENTS, *SCENARIO_NAMES):
-        assert name in re.sub(r"- +", "-", page)
-
-
 @pytest.mark.parametrize(
     ("given", "levels", "blind"),
     [
@@ -246,14 +243,11 @@ def test_what_is_not_utf_8_on_the_command_line_is_refused(tmp_path, words):
     assert not list(tmp_path.iterdir())
 
 
-def test_closed_streams_do_not_stop_a_command(tmp_path):
+def test_closed_streams_and_readers_that_end_do_not_stop_a_command(tmp_path):
     shown = tmp_path / "mini.png"
     command = shlex.join([*PARKENV, "lot", "show", "mini", "--out", str(shown)])
     assert subprocess.run(f"{command} >&- 2>&-", shell=True).returncode == 0
     assert shown.exists()
-
-
-def test_a_reader_that_ends_is_not_complained_about():
     with subprocess.Popen(
         [*PARKENV, "schema", "compare"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as command:

@@ -127,12 +127,15 @@ def test_a_caller_is_compiled_again_when_what_it_calls_or_reads_changes(own, tmp
     assert not kept(own), "nothing is written beside the sources, which may be read-only"
 
 
-def test_a_folder_that_cannot_be_written_costs_time_and_is_told_of_once(own, tmp_path):
+def test_what_keeps_code_from_being_kept_or_compiled_is_told_in_a_line(own, tmp_path):
     (tmp_path / "file").write_text("")
     value, told = result(start(own, tmp_path / "file" / "cache"))
     assert value == 4.0
     assert [CANNOT_KEEP in line for line in told] == [False, True]
     assert "NUMBA_CACHE_DIR" in told[1]
+    process = start(own, tmp_path / "cache", NUMBA_DISABLE_JIT="1")
+    assert "NUMBA_DISABLE_JIT is set, want it unset" in process.communicate()[1].splitlines()[-1]
+    assert process.returncode == 1
 
 
 @pytest.mark.slow
@@ -143,12 +146,6 @@ def test_of_processes_that_need_the_same_code_one_compiles_it(own, tmp_path):
     assert sum(compiled for _, compiled, _ in together) == 2
     assert ended(start(own, cache)) == (4.0, 0, [])
     assert all(path.suffix == ".nbc" for path in cache.rglob("*") if path.is_file())
-
-
-def test_without_compilation_one_line_says_what_is_wanted(own, tmp_path):
-    process = start(own, tmp_path / "cache", NUMBA_DISABLE_JIT="1")
-    assert "NUMBA_DISABLE_JIT is set, want it unset" in process.communicate()[1].splitlines()[-1]
-    assert process.returncode == 1
 
 
 @pytest.mark.parametrize("raises", [False, True])

@@ -235,13 +235,18 @@ def test_other_files_are_refused(tmp_path, text, message):
         Counts.read(path)
 
 
-def test_unknown_names_are_refused(tmp_path):
+def test_names_zones_and_capacities_that_do_not_fit_are_refused(tmp_path):
     counts = read(tmp_path, rows_of(free_places(2)))
     assert is_counts(tmp_path / "counts.csv")
     with pytest.raises(InputError, match=r"has no car park 'center'; did you mean 'centre'"):
         counts.chosen(["center"])
     with pytest.raises(InputError, match="timezone is 'Berlin'"):
         Counts.read(tmp_path / "counts.csv", "Berlin")
+    rows = ["a,2024-03-01T08,30", "b,2024-03-01T08,30"]
+    with pytest.raises(InputError, match="has 2 car parks, want a column of their capacities"):
+        read(tmp_path, rows, "car_park,hour,free", capacity=90)
+    with pytest.raises(InputError, match="has a column 'capacity', want no --capacity"):
+        read(tmp_path, [f"a,90,{rows[0][2:]}"], capacity=90)
 
 
 DIALECTS = {
@@ -270,27 +275,16 @@ def test_tables_of_times_and_places_are_read_with_a_capacity(tmp_path, header, r
     np.testing.assert_allclose(counts.occupied[0], 1 - free / CAPACITY)
 
 
-def test_free_and_taken_places_are_the_capacity(tmp_path):
+def test_free_and_taken_places_are_the_capacity_and_readings_without_a_value_gaps(tmp_path):
     counts = read(tmp_path, ["2024-03-01T08:00;30;70", "2024-03-01T09:00;20;80"], "hour;free;taken")
     np.testing.assert_allclose(counts.occupied[0, 0, 8:10], [0.7, 0.8])
     np.testing.assert_array_equal(counts.capacity, 100)
-
-
-def test_readings_without_a_value_are_gaps(tmp_path):
     rows = ["2024-03-01T08:00;k.A.", "2024-03-01T09:00;30", "2024-03-01T10:00;", "2024-03-01T11:00;n/a"]
     counts = read(tmp_path, rows, "hour;frei", capacity=100)
     assert np.flatnonzero(np.isfinite(counts.occupied[0, 0])).tolist() == [9]
 
 
-def test_a_capacity_belongs_to_one_car_park_without_its_own(tmp_path):
-    rows = ["a,2024-03-01T08,30", "b,2024-03-01T08,30"]
-    with pytest.raises(InputError, match="has 2 car parks, want a column of their capacities"):
-        read(tmp_path, rows, "car_park,hour,free", capacity=90)
-    with pytest.raises(InputError, match="has a column 'capacity', want no --capacity"):
-        read(tmp_path, [f"a,90,{rows[0][2:]}"], capacity=90)
-
-
-def test_usual_days_are_those_of_their_class_without_the_day_itself(tmp_path):
+def test_usual_days_are_those_of_their_class_and_need_another_day(tmp_path):
     counts = read(tmp_path, rows_of(free_places(30)))
     y = counts.occupied[0]
     mean, sd = usual_days(y, counts.weekday, "counts")
@@ -304,9 +298,6 @@ def test_usual_days_are_those_of_their_class_without_the_day_itself(tmp_path):
     again, _ = usual_days(changed, counts.weekday, "counts")
     np.testing.assert_array_equal(again[saturdays[0]], mean[saturdays[0]])
     assert (again[saturdays[1]] < mean[saturdays[1]]).any()
-
-
-def test_usual_days_need_another_day_and_fill_hours_without_a_reading():
     y = np.full((2, 24), np.nan)
     y[:, 8:20] = 0.5
     mean, sd = usual_days(y, np.array([0, 5]), "counts")

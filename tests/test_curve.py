@@ -81,9 +81,6 @@ def test_curves_grow_with_demand_and_their_intervals_hold_the_truth(made):
     np.testing.assert_allclose(value[whole][0], truth, rtol=0.08)
     assert (low < value).mean() > 0.99
     assert (value < high).mean() > 0.99
-
-
-def test_the_interval_of_a_share_ends_at_all(made):
     full = np.random.default_rng(0).uniform(size=(DAYS, N_ZONES * N_HOURS, 1)) > 0.05
     parked = np.where(full, 0.0, made.sums["cars"] // 2)
     table = curve_table(dataclasses.replace(made, sums={**made.sums, "parked": parked}), 2, 0)

@@ -161,11 +161,17 @@ def test_the_code_of_a_page_and_an_example_run_from_top_to_bottom(name, tmp_path
             del sys.modules[added]
 
 
-def test_links_and_pictures_exist():
+def test_links_pictures_options_and_agents_of_pages_exist():
+    """Every option in backticks is one of some command."""
     for name, page in PAGES.items():
         for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page):
             if not target.startswith("http"):
                 assert (ROOT / name).parent.joinpath(target).exists(), f"{name}: {target}"
+    known = set().union(*map(options_of, COMMANDS.values()))
+    for name, page in PAGES.items():
+        assert set(re.findall(r"`(--[a-z-]+)[^`]*`", page)) - known <= OTHERS, name
+    listed = re.findall(r"^\| `([a-z-]+)` \|", PAGES["docs/agents.md"], flags=re.MULTILINE)
+    assert sorted(listed) == sorted(AGENTS)
 
 
 def options_of(command):
@@ -183,20 +189,8 @@ def test_commands_have_options_that_exist():
         assert {word for word in words if word.startswith("--")} <= known, f"{name}: {words}"
 
 
-def test_options_that_pages_name_exist():
-    """Every option in backticks is one of some command."""
-    known = set().union(*map(options_of, COMMANDS.values()))
-    for name, page in PAGES.items():
-        assert set(re.findall(r"`(--[a-z-]+)[^`]*`", page)) - known <= OTHERS, name
-
-
 OTHERS = {"--version", "--install-completion", "--show-completion", "--num-envs"}
 """Options of `parkenv` itself, and of other programs, such as CleanRL's."""
-
-
-def test_agents_in_the_table_are_the_agents_there_are():
-    listed = re.findall(r"^\| `([a-z-]+)` \|", PAGES["docs/agents.md"], flags=re.MULTILINE)
-    assert sorted(listed) == sorted(AGENTS)
 
 
 WORDS = {

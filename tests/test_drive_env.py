@@ -176,17 +176,13 @@ def test_rolling_through_the_middle_is_not_parking():
     assert [s[4]["is_success"] for s in steps] == [False, False, True]
 
 
-def test_a_contact_terminates_is_named_and_costs():
+def test_a_contact_and_leaving_the_area_terminate_are_named_and_cost():
     env = make("campus", kinds=("perpendicular",), occupancy=1.0, contact_cost=50.0)
     placed_at(env, -0.2, 1.2, 0.0)
     _, reward, terminated, truncated, info = env.step(STILL)
     assert (terminated, truncated, info["is_success"]) == (True, False, False)
     assert CONTACTS[info["contact"]] in ("parked car", "kerb")
     assert reward == pytest.approx(-CONTROL_S - 50.0)
-
-
-def test_leaving_the_area_terminates():
-    """Along the aisle before the slot, on asphalt all the way."""
     env = make("campus", slot="C10", occupancy=0.0)
     placed_at(env, -5.5, AREA - 0.1, math.pi / 2, speed=2.0)
     _, reward, terminated, _, info = env.step(STILL)
@@ -250,15 +246,12 @@ def test_slack_clears_the_slots_beside_and_distance_moves_the_start():
     assert start_away((0.2, 0.5), "way-out") < start_away((4.0, 5.0), "way-out")
 
 
-def test_the_laser_sees_the_neighbours_and_no_scan_is_there_unasked():
+def test_the_laser_sees_the_neighbours_and_the_map_of_obstacles_holds_all_that_is_near():
     env = make(kinds=("perpendicular",), occupancy=1.0, laser=LaserScanner(noise_sd=0.0, dropout=0.0))
     scan = env.reset(seed=3)[0]["scan"]
     assert scan.shape == (1081,)
     assert 1.0 < scan.min() < 4.0
     assert "scan" not in make().reset(seed=3)[0]
-
-
-def test_the_obstacle_map_holds_everything_near_in_the_frame_of_the_slot():
     env = make("campus", obstacle_map=True)
     observation, _ = env.reset(seed=3)
     task = env.unwrapped.task

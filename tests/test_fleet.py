@@ -237,7 +237,7 @@ def test_the_first_car_at_a_slot_has_it_and_the_second_fails():
     assert first["left_at"] == first["ended_at"] + 15.0
 
 
-def test_residents_leave_and_do_not_come_back():
+def test_residents_leave_when_they_did_and_do_not_come_back(tmp_path):
     fleet = Fleet("campus", Demand(PoissonArrivals(1.0, 0.0, 86400.0)), drivers=[GREEDY])
     fleet.reset(2)
     before = fleet.taken()
@@ -245,9 +245,6 @@ def test_residents_leave_and_do_not_come_back():
     standing = fleet.taken() & (fleet.slots["car"] < 0)
     assert 0 < standing.sum() < before.sum()
     assert not (standing & ~before).any()
-
-
-def test_residents_of_a_recorded_day_leave_when_its_cars_did(tmp_path):
     scenario, path = parkenv.make_scenario("mini"), tmp_path / "log.csv"
     ends = [15 + k % 3 for k in range(scenario.lot.n_slots)]
     path.write_text("bay,arrival,departure\n" + "".join(

@@ -45,11 +45,15 @@ def days_of(study):
     return [[study.run_day(one, day) for day in range(study.days)] for one in study.fleet_settings]
 
 
-def test_gini():
+def test_gini_and_the_search_by_random_looks_have_their_closed_forms():
     assert gini(np.array([2.0, 2.0, 2.0])) == gini(np.zeros(3)) == 0.0
     assert gini(np.array([1.0, 3.0])) == pytest.approx(0.25)
     exponential = np.random.default_rng(0).exponential(size=20_000)
     assert gini(exponential) == pytest.approx(0.5, abs=0.01)
+    problem = SearchProblem(lot=grid_lot(1, 20))
+    one, all_but_none = random_order_search_s(problem, np.array([0.0, 1.0]))
+    hop_s = 2.5 / problem.v_drive
+    assert all_but_none - one == pytest.approx(20 * hop_s, rel=0.05)
 
 
 def test_nobody_without_members_is_run_once():
@@ -123,16 +127,11 @@ def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
     assert math.isnan(summarize_days(days[:1])[0]["price_of_anarchy"])
 
 
-def test_the_closed_form_of_random_looks_ends_at_the_last_slot():
-    problem = SearchProblem(lot=grid_lot(1, 20))
-    one, all_but_none = random_order_search_s(problem, np.array([0.0, 1.0]))
-    hop_s = 2.5 / problem.v_drive
-    assert all_but_none - one == pytest.approx(20 * hop_s, rel=0.05)
-
-
-def test_an_experiment_without_bounds_is_refused():
+def test_experiments_without_bounds_or_of_unequal_hours_are_refused():
     with pytest.raises(InputError, match="40000000 days"):
         experiment(days=10_000, arrivals_per_hour=tuple(map(float, range(1, 1001))))
+    with pytest.raises(InputError, match=r"arrivals\.hours of 'after' are not those of 'before'"):
+        study(BEFORE, AFTER | {"arrivals": {"hours": "09:00-10:00"}}).check()
 
 
 def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
@@ -231,11 +230,6 @@ def test_changes_are_paired_by_day_and_by_car(days):
     assert row["better_off"] + row["worse_off"] <= 1.0
     assert row["before"] == "own observations"
     assert row["after"] == "reservations for 50 %"
-
-
-def test_only_equal_hours_have_the_same_cars():
-    with pytest.raises(InputError, match=r"arrivals\.hours of 'after' are not those of 'before'"):
-        study(BEFORE, AFTER | {"arrivals": {"hours": "09:00-10:00"}}).check()
 
 
 def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():

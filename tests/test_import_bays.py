@@ -110,7 +110,7 @@ def test_meters_become_slots_on_their_side_of_their_street(
     np.testing.assert_allclose(heading, traffic, atol=1e-3)
 
 
-def test_outlines_are_slots_as_drawn(tmp_path):
+def test_outlines_are_slots_as_drawn_and_keep_their_ids(tmp_path):
     """Along the street, across it and at an angle, with their own sizes, entered from the street."""
     boxes = [
         (-90, 5, 6.1, 2.2, 2),
@@ -126,6 +126,9 @@ def test_outlines_are_slots_as_drawn(tmp_path):
     np.testing.assert_allclose(draft.slots.length[order], [6.1, 5.2, 5.0, 5.0], atol=0.02)
     np.testing.assert_allclose(np.degrees(draft.slots.yaw[order]) % 360, [182, 270, 240, 300], atol=0.3)
     assert (draft.slots.outward()[order, 1] * [-1, 1, 1, 1] > 0.8).all()
+    spaces = outlines(tmp_path / "spaces.geojson", [(2.6 * k, 0, 5.0, 2.5, 90) for k in range(12)])
+    names = import_lot(spaces, ImportOptions(guess_entry=True, guess_goal=True)).slot_ids
+    assert set(names) == {str(1000 + k) for k in range(12)}
 
 
 def test_close_meters_are_across_the_street_and_those_of_one_post_side_by_side(tmp_path):
@@ -253,12 +256,6 @@ def test_the_command_writes_the_lot_and_what_is_left_out(tmp_path):
     beside = ("lot", "import", str(streets), "--bays", str(bays), "--out", str(bays.with_suffix(".geojson")))
     assert f"would replace {bays}, which is read" in refused(*beside)
     assert len(rows_in(bays)) == 10
-
-
-def test_the_plain_import_of_outlines_keeps_their_ids(tmp_path):
-    spaces = outlines(tmp_path / "spaces.geojson", [(2.6 * k, 0, 5.0, 2.5, 90) for k in range(12)])
-    names = import_lot(spaces, ImportOptions(guess_entry=True, guess_goal=True)).slot_ids
-    assert set(names) == {str(1000 + k) for k in range(12)}
 
 
 def streets_of(register, out, columns, monkeypatch):

@@ -49,7 +49,7 @@ def test_all_formats_give_the_same_lot(tmp_path, flat):
         np.testing.assert_array_equal(getattr(other.lot(), name), getattr(draft.lot(), name))
 
 
-def test_native_lots_pass_through(tmp_path):
+def test_native_lots_pass_through_and_a_map_is_none(tmp_path):
     lot = packaged_lot("mini")
     write_lot(lot, tmp_path / "mini.geojson")
     assert import_lot(tmp_path / "mini.geojson").lot() == lot
@@ -57,9 +57,6 @@ def test_native_lots_pass_through(tmp_path):
     assert moved.goals.tolist() == [[3.0, 4.0]]
     with pytest.raises(InputError, match="bounds apply to OpenStreetMap"):
         import_lot(tmp_path / "mini.geojson", ImportOptions(bounds=((0, 0), (9, 9))))
-
-
-def test_a_map_is_no_lot_and_the_error_says_what_makes_one_of_it(tmp_path):
     for name, text in (("a.osm", car_park().xml()), ("a.json", car_park().geojson())):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=r"`parkenv lot import .* makes a lot of it"):
@@ -206,10 +203,19 @@ def test_areas_are_closed_at_the_edge_of_the_map(tmp_path):
     assert reasons(draft)["multipolygons with an open outline"] == ("relation/3",)
 
 
-def test_what_has_no_node_in_the_file_is_listed(tmp_path):
+def test_what_is_cut_deleted_or_stands_twice_counts_once_or_not(tmp_path):
+    """Elements may stand twice, with and without tags, as Overpass writes them for `out body; >; out skel qt;`."""
     draft = of_text(tmp_path, clipped(car_park().box(90, 0, 95, 5, SPACE), 65))
     assert reasons(draft)["ways beyond the edge of the map"] == ("way/30",)
     assert len(draft.slots) == 22
+    draft = of_text(tmp_path, car_park().xml().replace('<way id="4">', '<way id="4" visible="false">'))
+    assert len(draft.slots) == 21
+    assert "way/4" not in draft.slot_ids
+    text = car_park().xml()
+    again = re.sub(r"<tag [^>]*/>", "", text[text.index("<node") : text.index("</osm>")])
+    once, twice = of_text(tmp_path, text), of_text(tmp_path, text.replace("</osm>", again + "</osm>"))
+    assert twice.slot_ids == once.slot_ids
+    assert np.array_equal(twice.slots.xy, once.slots.xy)
 
 
 def test_packed_maps_and_extracts_give_the_same_lot(tmp_path):
@@ -221,21 +227,6 @@ def test_packed_maps_and_extracts_give_the_same_lot(tmp_path):
             writer.add(element)
     for suffix in ("gz", "bz2", "pbf"):
         assert import_lot(tmp_path / f"a.osm.{suffix}").lot() == import_lot(plain).lot()
-
-
-def test_elements_may_stand_twice_with_and_without_tags(tmp_path):
-    """As Overpass writes them for `out body; >; out skel qt;`."""
-    text = car_park().xml()
-    again = re.sub(r"<tag [^>]*/>", "", text[text.index("<node") : text.index("</osm>")])
-    once, twice = of_text(tmp_path, text), of_text(tmp_path, text.replace("</osm>", again + "</osm>"))
-    assert twice.slot_ids == once.slot_ids
-    assert np.array_equal(twice.slots.xy, once.slots.xy)
-
-
-def test_deleted_elements_are_not_there(tmp_path):
-    draft = of_text(tmp_path, car_park().xml().replace('<way id="4">', '<way id="4" visible="false">'))
-    assert len(draft.slots) == 21
-    assert "way/4" not in draft.slot_ids
 
 
 @settings(max_examples=6)

@@ -104,7 +104,7 @@ def test_what_cannot_be_is_refused(make, change, message):
     assert re.search(message, refusal(make, **change))
 
 
-def test_a_lot_is_frozen():
+def test_a_lot_is_frozen_and_compares_and_pickles_by_what_it_holds():
     lot = ParkingLot(**ONE_SLOT)
     with pytest.raises(FrozenInstanceError):
         lot.name = "two"
@@ -113,10 +113,6 @@ def test_a_lot_is_frozen():
         if isinstance(value, np.ndarray):
             with pytest.raises(ValueError, match="read-only"):
                 value[...] = 0
-
-
-def test_lots_compare_by_what_they_hold_and_pickle():
-    lot = ParkingLot(**ONE_SLOT)
     assert lot == ParkingLot(**ONE_SLOT)
     assert lot == pickle.loads(pickle.dumps(lot))
     assert lot != ParkingLot(**{**ONE_SLOT, "goals": [[20.0, 11.0]]})
@@ -155,9 +151,13 @@ def test_city_has_exactly_the_slots_asked_for_and_every_place_leads_to_every_oth
     assert any(lane.oneway for lane in lot.lanes) or n_slots < 600
 
 
-def test_city_is_the_same_for_the_same_seed_only():
+def test_city_is_that_of_its_seed_and_numbers_neighbours_near_each_other():
     assert city_lot(300, seed=1) == city_lot(300, seed=1)
     assert city_lot(300, seed=1) != city_lot(300, seed=2)
+    lot = city_lot(5000, seed=0)
+    step = np.hypot(*np.diff(lot.slot_xy, axis=0).T)
+    assert np.median(step) < 10.0
+    assert np.mean(step) < 60.0
 
 
 def test_city_parks_at_the_kerb_and_clear_of_crossings():
@@ -174,13 +174,6 @@ def test_city_parks_at_the_kerb_and_clear_of_crossings():
     assert not shapely.intersects(shapely.polygons(lot.slot_corners()), houses).any()
     assert not shapely.intersects(houses, lanes)
     assert not shapely.contains_xy(houses, *lot.goals.T).any()
-
-
-def test_city_numbers_neighbours_near_each_other():
-    lot = city_lot(5000, seed=0)
-    step = np.hypot(*np.diff(lot.slot_xy, axis=0).T)
-    assert np.median(step) < 10.0
-    assert np.mean(step) < 60.0
 
 
 @pytest.mark.parametrize("name", ["street", "mini"])
@@ -240,16 +233,16 @@ def test_edges_have_the_speed_of_their_lane_also_behind_an_entry():
             assert graph.edge_speed[vertex, column] == (2.0 if fast else 1.0)
 
 
-def test_one_way_lane_is_one_chain_that_serves_both_sides():
+def test_vertices_stand_before_their_slots_along_one_way_bent_and_full_lanes():
     graph = graph_of([([(0, 0), (30, 0)], ONE_WAY)], [(20, 3), (10, -3), (15, 3)])
     assert moves(graph) == {(3, 1), (1, 2), (2, 0), (0, 4)}
     np.testing.assert_allclose(graph.vertex_xy[:3, 1], 0.0)
-
-
-def test_lane_bends_do_not_shorten_the_way():
     graph = graph_of([([(0, 0), (10, 0), (10, 10)], ONE_WAY)], [(5, -2), (12, 5)])
     assert graph.edge_length[0, graph.neighbors[0] == 1].item() == pytest.approx(10.0)
     assert graph.vertex_yaw[1] == pytest.approx(np.pi / 2)
+    stations = np.arange(1.25, 39.0, 2.5)
+    graph = graph_of([([(0, 0), (40, 0)], TWO_WAY)], [(x, -3.0) for x in stations])
+    np.testing.assert_allclose(graph.vertex_xy[: len(stations), 0], stations)
 
 
 @given(
@@ -269,13 +262,7 @@ def test_vertices_keep_their_distance(stations, sides, oneway):
         assert (np.diff(np.r_[0.0, along, 40.0]) >= gap - 1e-6).all()
 
 
-def test_vertices_that_have_room_stay_before_their_slots():
-    stations = np.arange(1.25, 39.0, 2.5)
-    graph = graph_of([([(0, 0), (40, 0)], TWO_WAY)], [(x, -3.0) for x in stations])
-    np.testing.assert_allclose(graph.vertex_xy[: len(stations), 0], stations)
-
-
-def test_loop_lane_can_be_driven_round():
+def test_loops_can_be_driven_round_and_are_no_edges_to_themselves():
     ring = [(0, 0), (30, 0), (30, 20), (0, 20), (0, 0)]
     graph = graph_of([(ring, ONE_WAY)], [(15, -3), (15, 23)])
     g = nx.DiGraph(sorted(moves(graph)))
@@ -283,9 +270,6 @@ def test_loop_lane_can_be_driven_round():
     assert not any(i == j for i, j in moves(graph))
     total = sum(graph.edge_length[graph.neighbors >= 0])
     assert total == pytest.approx(100.0)
-
-
-def test_lane_out_and_back_to_a_junction_is_no_edge_to_itself():
     graph = graph_of([([(-20, 0), (0, 0)], TWO_WAY), ([(0, 0), (10, 5), (10, -5), (0, 0)], TWO_WAY)])
     assert not any(i == j for i, j in moves(graph))
     assert nx.is_strongly_connected(nx.DiGraph(sorted(moves(graph))))
@@ -323,16 +307,13 @@ def test_columns_are_the_best_assignment_of_bearings(bearings):
     assert got == pytest.approx(misfit[linear_sum_assignment(misfit)].sum(), abs=1e-9)
 
 
-def test_five_lanes_out_of_one_junction_are_refused():
+def test_what_no_lane_serves_and_junctions_of_five_lanes_are_listed():
     angles = np.arange(5) * 2 * np.pi / 5
     with pytest.raises(GraphError, match=r"junction .* has 5 lanes that lead away") as caught:
         graph_of([([(0, 0), (50 * np.cos(a), 50 * np.sin(a))], TWO_WAY) for a in angles])
     np.testing.assert_allclose(caught.value.problems[0].xy, (0, 0))
     # Five that meet are fine as long as four lead away.
     graph_of([([(50 * np.cos(a), 50 * np.sin(a)), (0, 0)], a == 0.0) for a in angles])
-
-
-def test_what_no_lane_serves_is_listed():
     lane = [([(0, 0), (40, 0)], TWO_WAY)]
     with pytest.raises(GraphError, match="slot 1: is on no lane") as caught:
         graph_of(lane, [(10, -3), (10, SLOT_REACH + 1), (20, -30)])

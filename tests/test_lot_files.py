@@ -126,12 +126,21 @@ def test_parking_costs_need_no_exact_shape_and_stand_with_their_slot(tmp_path):
     assert slots[1]["parking_cost_s"] == 120.0
 
 
-def test_a_lot_is_not_written_where_it_could_not_be_read(tmp_path):
+def test_files_that_cannot_be_written_or_read_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"written as \.geojson or \.json"):
         write_lot(packaged_lot("mini"), tmp_path / "lot.yml")
     with pytest.raises(InputError, match="cannot be written"):
         write_lot(packaged_lot("mini"), tmp_path / "nowhere" / "lot.geojson")
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match="No such file"):
+        read_lot(tmp_path / "lot.geojson")
+    with pytest.raises(InputError, match=r"unknown kind of file '\.osm'"):
+        read_lot(tmp_path / "lot.osm")
+    with pytest.raises(InputError, match=r"not JSON: .* at line 1 column"):
+        read(tmp_path, json.dumps(document())[:-37])
+    (tmp_path / "lot.json").write_bytes(b'{"name": "\xff"}')
+    with pytest.raises(InputError, match="not UTF-8 text"):
+        read_lot(tmp_path / "lot.json")
 
 
 @pytest.mark.parametrize(
@@ -298,18 +307,6 @@ def test_faults_are_named(tmp_path, change, number, message):
     assert message in errors[0].message
     where = "" if number is None else f"feature {number}: "
     assert refusal(read_lot, path) == f"{path}: {where}{errors[0].message}"
-
-
-def test_files_that_are_not_there_or_no_text_are_refused(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
-        read_lot(tmp_path / "lot.geojson")
-    with pytest.raises(InputError, match=r"unknown kind of file '\.osm'"):
-        read_lot(tmp_path / "lot.osm")
-    with pytest.raises(InputError, match=r"not JSON: .* at line 1 column"):
-        read(tmp_path, json.dumps(document())[:-37])
-    (tmp_path / "lot.json").write_bytes(b'{"name": "\xff"}')
-    with pytest.raises(InputError, match="not UTF-8 text"):
-        read_lot(tmp_path / "lot.json")
 
 
 def moved(doc, change):

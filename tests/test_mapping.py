@@ -33,16 +33,13 @@ from sim_sensors.rig import Mount
 LASER, MOUNT = LaserScanner(), Mount(z=0.5)
 
 
-def test_a_look_frees_cells_before_a_car_and_leaves_those_behind_it():
+def test_looks_free_and_fill_cells_as_the_filter_says():
     grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.25)
     grid.update((0.1, 0.1), 0.0, math.radians(30.0), np.array([[0.0, 5.0]]), 10.0, car=4.0)
     row, columns = int(5.1 / 0.25), [int(x / 0.25) for x in (3.0, 7.0, 9.6)]  # before, on and behind the car
     assert grid.probability[row, columns] == pytest.approx([P_FREE, P_OCCUPIED, 0.5], abs=1e-6)
     assert not grid.seen[row, columns[-1]]
     assert grid.probability[0, -1] == 0.5
-
-
-def test_looks_add_up_as_the_filter_says():
     grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.25)
     for _ in range(3):
         grid.update((0.1, 0.1), 0.0, 0.5, np.empty((0, 2)), 10.0)
@@ -88,7 +85,7 @@ def test_people_and_traffic_are_not_parked_cars_nor_are_those_that_left_during_t
     assert not drive_by(mini, scene, slots=full).states().occupied.any()
 
 
-def test_a_slot_that_nobody_saw_stays_unknown(mini):
+def test_unseen_slots_stay_unknown_and_a_detection_goes_to_its_slot_alone(mini):
     slots = SlotFilter(mini)
     pose = np.array([*mini.vertex_xy[0], 0.0])
     wall = np.full(LASER.n_beams, 0.5, np.float32)
@@ -96,12 +93,9 @@ def test_a_slot_that_nobody_saw_stays_unknown(mini):
     states = slots.states()
     assert not states.in_view.any()
     assert (states.p_occupied == 0.5).all()
-
-
-def test_a_detection_goes_to_its_slot_and_one_elsewhere_to_none(mini):
-    slots = SlotFilter(mini)
     xy = np.array([mini.slot_xy[3] + [0.3, -0.4], mini.slot_xy[3] + [0.0, 50.0]])
     cars = LocatedCars(xy, np.zeros(2), np.ones((2, 2)), np.ones(2), np.ones(2, np.float32), np.arange(2))
+    slots = SlotFilter(mini)
     assert slots.update_from_cars(cars).tolist() == [3, -1]
     states = slots.states()
     assert states.occupied.tolist() == [i == 3 for i in range(mini.n_slots)]

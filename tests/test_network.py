@@ -227,20 +227,17 @@ def test_bad_files_are_one_clear_line(tmp_path, content, wanted):
     assert str(path) in str(caught.value)
 
 
-def test_own_weights_are_named_after_a_colon(tmp_path):
+def test_the_shipped_network_is_small_and_own_weights_are_named_after_a_colon(tmp_path):
+    policy = NetworkPolicy.load()
+    assert sum(w.size for w in policy.weights.values()) < 300_000
+    assert policy.card.trained_on
+    assert policy.card.command[:3] == ("parkenv", "train", "network")
     path = tmp_path / "own.safetensors"
     path.write_bytes(SHIPPED.read_bytes())
     scenario = make_scenario("mini")
     own, shipped = make_agent(f"network:{path}", scenario), make_agent("network", scenario)
     assert [d[1] for d in decisions(own, scenario, 1)] == [d[1] for d in decisions(shipped, scenario, 1)]
     assert agent_file(f"network:{path}") == path
-
-
-def test_the_shipped_network_is_small_and_says_what_it_is():
-    policy = NetworkPolicy.load()
-    assert sum(w.size for w in policy.weights.values()) < 300_000
-    assert policy.card.trained_on
-    assert policy.card.command[:3] == ("parkenv", "train", "network")
 
 
 @pytest.mark.parametrize("name", ["campus", "street", "jam", "mini"])

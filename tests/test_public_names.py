@@ -49,14 +49,11 @@ def test_import_changes_no_signal_handler_and_loads_no_study():
     )
 
 
-def test_a_comparison_needs_no_folder():
+def test_a_comparison_needs_no_folder_and_knows_its_fields():
     agents = ["first-free", "greedy-goal"]
     result = parkenv.compare(scenarios=["mini"], agents=agents, episodes=2, jobs=1, figures=False)
     assert {row["agent"] for row in result.rows} == set(agents)
     assert result.complete
-
-
-def test_an_unknown_field_is_answered_by_the_nearest():
     with pytest.raises(parkenv.InputError, match=r"unknown key 'episods'; did you mean 'episodes'"):
         parkenv.compare(episods=3)
 

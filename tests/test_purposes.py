@@ -43,13 +43,10 @@ def drawn(demand, episode=0):
     return demand.draw(world_key(1, episode), WINDOW[0], 2, DAY)
 
 
-def test_one_unnamed_purpose_is_the_demand_itself():
+def test_purposes_keep_their_cars_whoever_else_comes():
     alone = Demand(Headways(30), ExponentialTime(900.0), goal_weights=(1.0, 3.0))
     for ours, its in zip(drawn(TownDemand((alone,))), drawn(alone), strict=True):
         assert_array_equal(ours, its)
-
-
-def test_purposes_keep_their_cars_whoever_else_comes():
     town, alone = drawn(TownDemand((RESIDENTS, COMMUTERS))), drawn(COMMUTERS)
     its = town.purpose == 1
     assert_array_equal(town.arrival_s[its], alone.arrival_s)
@@ -63,9 +60,6 @@ def test_purposes_keep_their_cars_whoever_else_comes():
     assert np.isnan(town.value_of_time[~its]).all()
     assert (town.value_of_time[its] == 18.0).all()
     assert_array_equal(town.walks_back, ~its)
-
-
-def test_parked_cars_come_first_and_change_nobody_else():
     with_parked = drawn(Demand(COMMUTERS.arrivals, COMMUTERS.stay, name="commuters", parked=7))
     assert with_parked.parked.tolist() == [True] * 7 + [False] * (len(with_parked.parked) - 7)
     assert (with_parked.arrival_s[:7] == WINDOW[0]).all()

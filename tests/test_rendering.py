@@ -332,13 +332,10 @@ def played(env, keys, noop, monkeypatch):
     return actions
 
 
-def test_search_is_played_with_five_keys(monkeypatch):
+def test_environments_are_played_with_keys_and_two_at_once(monkeypatch):
     env = gym.make("parkenv/Search-v2", scenario="campus", render_mode="rgb_array")
     keys = [[pygame.K_w], [pygame.K_s], [pygame.K_a], [pygame.K_d], [pygame.K_SPACE]]
     assert played(env, keys, 4, monkeypatch) == [0, 1, 2, 3, 4]
-
-
-def test_drive_is_played_with_four_keys_and_two_at_once(monkeypatch):
     env = gym.make("parkenv/Drive-v1", render_mode="rgb_array")
     keys = [[pygame.K_w], [pygame.K_w, pygame.K_a], [pygame.K_d, pygame.K_s]]
     actions = played(env, keys, np.zeros(2, dtype=np.float32), monkeypatch)

@@ -203,7 +203,7 @@ def test_lanes_are_driven_as_they_may_be_but_for_slots_on_their_left(name):
         assert legal(lot, b, a)
 
 
-def test_one_aisle_is_driven_there_and_back():
+def test_one_aisle_is_driven_there_and_back_and_a_trap_not():
     lot = packaged_lot("mini")
     route = survey_route(lot)
     x = route.path[:, 0]
@@ -211,9 +211,6 @@ def test_one_aisle_is_driven_there_and_back():
     assert there_and_back <= route.length < there_and_back + 5.0  # a little for changing sides at the ends
     visits = np.bincount(route.vertices[route.vertices < lot.n_slots])
     assert (visits == 1).all()
-
-
-def test_no_way_back_is_said():
     lanes, slot = (
         (Lane([[0.0, 0.0], [20.0, 0.0]], oneway=True),),
         ([[10.0, -5.5]], [-np.pi / 2], [5.0], [2.5]),

@@ -144,7 +144,7 @@ def test_agents_in_python_know_their_own_stay(scenario):
     assert slots[0] == slots[1]
 
 
-def test_prices_are_added_to_those_of_paid_zones():
+def test_prices_are_added_to_those_of_paid_zones_and_set_by_hours():
     """Their hours, free minutes and limits stay; zones that cost nothing, or have another name, keep their prices."""
     day = Hours.parse("Mo-Fr 08:00-20:00")
     paid = Zone("kerb paid Mo-Fr", Price(2.0, free_s=900.0, charged=day), max_stay_s=7200.0)
@@ -157,6 +157,13 @@ def test_prices_are_added_to_those_of_paid_zones():
     assert Tariff({"garage": "+0.5"}).priced(others[1]).price == Price(2.5)
     with pytest.raises(InputError, match="no paid zone 'lot"):
         Tariff({"lot*": "+1"}).require_zones([paid, *others], "town")
+    zone = Tariff({"near": "1 @ 08:00-12:00; 3 @ 12:00-15:00"}).priced(Zone("near", Price(9.0)))
+    begin = np.array([7.0, 11.5, 16.0]) * 3600.0
+    assert zone.price.raised(1.0).amount(begin, 7200.0).tolist() == [2.0, 7.0, 0.0]
+    with pytest.raises(InputError, match="hourly"):
+        Price(1.0, hourly=zone.price.hourly)
+    with pytest.raises(InputError, match="price"):
+        Tariff({"near": "cheap"})
 
 
 def test_a_scenario_changes_the_rules_of_zones():
@@ -175,16 +182,6 @@ def test_a_scenario_changes_the_rules_of_zones():
     ):
         with pytest.raises(InputError, match=field):
             make_scenario({"base": "town", "zones": wrong})
-
-
-def test_prices_by_hours_are_a_tariff():
-    zone = Tariff({"near": "1 @ 08:00-12:00; 3 @ 12:00-15:00"}).priced(Zone("near", Price(9.0)))
-    begin = np.array([7.0, 11.5, 16.0]) * 3600.0
-    assert zone.price.raised(1.0).amount(begin, 7200.0).tolist() == [2.0, 7.0, 0.0]
-    with pytest.raises(InputError, match="hourly"):
-        Price(1.0, hourly=zone.price.hourly)
-    with pytest.raises(InputError, match="price"):
-        Tariff({"near": "cheap"})
 
 
 DEAR_S = 600.0

@@ -137,10 +137,18 @@ class Waits:
         return int(np.flatnonzero(observation["action_mask"] == 0)[0]), state
 
 
-def test_a_planner_that_finishes_nothing_cannot_be_cloned(monkeypatch):
+def test_cloning_wants_finished_searches_and_takes_the_read_only_arrays_of_a_worker(monkeypatch):
     monkeypatch.setattr("parkenv.studies.training.training.make_agent", lambda *_: Waits())
     with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to clone"):
         Demonstrations.collect("waits", SCENARIO, [5_000_000])
+    monkeypatch.undo()
+    shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
+    for array in (shown.local, shown.masks, shown.actions, shown.times):
+        array.flags.writeable = False
+    model = PPO("MultiInputPolicy", SearchVecEnv(2, "mini"), n_steps=8, batch_size=16, seed=0)
+    before = model.policy.action_net.weight.clone()
+    clone(model, shown, 0, updates=1)
+    assert not torch.equal(before, model.policy.action_net.weight)
 
 
 @pytest.mark.slow
@@ -159,16 +167,6 @@ def test_cloning_begins_near_the_planner():
     # The mean would be of those few searches in which a clone drives in circles; on empty days any agent parks soon.
     cloned_s, planner_s, fresh_s = (np.quantile(times, 0.75) for times in (cloned, planner, fresh))
     assert cloned_s < 1.2 * planner_s < fresh_s
-
-
-def test_cloning_takes_the_read_only_arrays_of_a_worker():
-    shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
-    for array in (shown.local, shown.masks, shown.actions, shown.times):
-        array.flags.writeable = False
-    model = PPO("MultiInputPolicy", SearchVecEnv(2, "mini"), n_steps=8, batch_size=16, seed=0)
-    before = model.policy.action_net.weight.clone()
-    clone(model, shown, 0, updates=1)
-    assert not torch.equal(before, model.policy.action_net.weight)
 
 
 def test_a_model_decides_on_driven_trips(trained):
@@ -332,27 +330,23 @@ def test_a_training_in_this_process_leaves_global_seeds_and_threads(tmp_path):
     np.testing.assert_equal(now, drawn)
 
 
-def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
-    make_small(monkeypatch)
-    mark = tmp_path / "was_run"
-    torch.save({"format": "parkenv-checkpoint-3", "steps": Payload(mark)}, tmp_path / "checkpoint.pt")
-    with pytest.raises(InputError, match="no checkpoint of this version"):
-        search_training("ppo", 400, 400, [SCENARIO]).train(0, tmp_path)
-    assert not mark.exists()
-
-
-def test_a_checkpoint_that_does_not_fit_or_is_damaged_is_refused(tmp_path, monkeypatch):
+def test_a_checkpoint_that_does_not_fit_or_is_damaged_is_refused_and_runs_nothing(tmp_path, monkeypatch):
     make_small(monkeypatch)
     training, path = search_training("ppo", 1_100, 400, [SCENARIO]), tmp_path / "checkpoint.pt"
     stop_training(training, tmp_path, monkeypatch)
-    data = bytearray(path.read_bytes())
-    torch.save(torch.load(path, weights_only=True) | {"parameters": {}}, path)
-    with pytest.raises(InputError, match="does not fit this training"):
-        training.train(0, path.parent)
+    data, mark = bytearray(path.read_bytes()), tmp_path / "was_run"
+    for content, message in (
+        (torch.load(path, weights_only=True) | {"parameters": {}}, "does not fit this training"),
+        ({"format": "parkenv-checkpoint-3", "steps": Payload(mark)}, "no checkpoint of this version"),
+    ):
+        torch.save(content, path)
+        with pytest.raises(InputError, match=message):
+            training.train(0, tmp_path)
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     with pytest.raises(InputError, match="is not as it was written"):
-        training.train(0, path.parent)
+        training.train(0, tmp_path)
+    assert not mark.exists()
 
 
 LOTS = [make_scenario(grid_lot(2, 6 + i), name=f"lot{i}") for i in range(6)]

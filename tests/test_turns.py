@@ -275,7 +275,7 @@ def test_its_kerb_side_camera_looks_to_the_left():
     assert (name, mount.yaw) == ("left", -usual.yaw)
 
 
-def test_it_is_kept_in_files_and_imports_turn_parked_cars(tmp_path):
+def test_left_hand_traffic_is_kept_in_files_and_imports_turn_parked_cars(tmp_path):
     path = tmp_path / "street.geojson"
     write_lot(LotDraft.of_lot(packaged_lot("campus")).in_left_hand_traffic().lot(), path)
     lot = read_lot(path)
@@ -289,9 +289,6 @@ def test_it_is_kept_in_files_and_imports_turn_parked_cars(tmp_path):
     path.write_text(path.read_text().replace('"traffic": "left"', '"traffic": "middle"'))
     with pytest.raises(InputError, match="traffic is 'middle', want 'left' or 'right'"):
         read_lot(path)
-
-
-def test_the_command_imports_it(tmp_path):
     write_lot(packaged_lot("mini"), tmp_path / "mini.geojson")
     ran("lot", "import", str(tmp_path / "mini.geojson"), "--left-hand", "--out", str(tmp_path / "l.geojson"))
     assert read_lot(tmp_path / "l.geojson").left_hand

@@ -100,13 +100,10 @@ def test_workers_without_tasks_are_killed_on_request():
     assert squares(Workers(2), 3) == {0: 0, 1: 1, 2: 4}, "others are started"
 
 
-def test_workers_print_no_lines_into_the_progress_bars_of_their_parent(capfd):
+def test_workers_print_nothing_into_the_progress_bars_and_dying_again_and_again_end_the_run(capfd):
     with Workers(2) as workers:
         list(workers.results([killed_once.warn] * 2))
     assert capfd.readouterr().err == ""
-
-
-def test_workers_that_die_again_and_again_end_the_run_with_a_word():
     with Workers(2) as workers, pytest.raises(RuntimeError, match="3 times in a row a loky worker died"):
         list(workers.results([killed_once.die] * 2))
 
