@@ -58,14 +58,11 @@ def columns(run, table, purpose=ALL):
     return days
 
 
-def test_every_car_is_somewhere_at_the_end_of_each_hour(run):
+def test_blocks_and_hours_hold_all_cars_attempts_seconds_metres_and_coins(run):
     for day, cars in zip(columns(run, HOURS), run[1], strict=True):
         assert (sum(day[state] for state in STATES) == len(cars)).all()
         assert day["due"][-1] == day["searching"][-1] == 0
         assert day["balked"][-1] == (cars["slot"] < 0).sum() > 0
-
-
-def test_blocks_hold_all_cars_attempts_seconds_metres_and_coins(run):
     for blocks, hours, cars in zip(columns(run, BLOCKS), columns(run, HOURS), run[1], strict=True):
         assert blocks["arrivals"].sum() == len(cars)
         assert blocks["refused"].sum() == cars["failed_parks"].sum() > 0

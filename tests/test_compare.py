@@ -35,12 +35,12 @@ def rows_without_times(out):
 def test_the_summary_is_what_the_episodes_say_and_jobs_do_not_matter(tmp_path):
     one, two = tmp_path / "one", tmp_path / "two"
     for out, jobs in ((one, 1), (two, 2)):
-        ran(*small(out, "--jobs", jobs, "--failure-cost", "10,90", "--v-walk-kmh", "4,10", episodes=25))
+        ran(*small(out, "--jobs", jobs, "--failure-cost", "10,90", "--v-walk-kmh", "4,10"))
     assert (one / "episodes.csv").read_bytes() == (two / "episodes.csv").read_bytes()
     assert rows_without_times(one) == rows_without_times(two)
 
     episodes, rows = rows_in(one / "episodes.csv"), rows_without_times(one)
-    assert len(episodes) == 25 * 3 * 2 * 2
+    assert len(episodes) == 12 * 3 * 2 * 2
     assert len(rows) == 3 * 2 * 2
     for row in rows:
         keys = ("agent", "failure_cost_s", "v_walk_kmh")
@@ -51,7 +51,7 @@ def test_the_summary_is_what_the_episodes_say_and_jobs_do_not_matter(tmp_path):
         terms = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
         assert row["total_s"] == pytest.approx(sum(row[term] for term in terms))
         assert row["regret_s"] >= -1e-9
-        assert row["episodes"] == 25
+        assert row["episodes"] == 12
     assert rows[1]["difference_s"] == pytest.approx(rows[1]["total_s"] - rows[0]["total_s"])
     assert summary_of(one)["command"][1] == "compare"
     assert {"version", "seed", "rows"} <= summary_of(one).keys()

@@ -12,7 +12,7 @@ from test_supply import GARAGE, town
 from parkenv import make_scenario, simulate
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.kernel import p_full
-from parkenv.engine.records import GAVE_UP, PARKED, SEARCHING
+from parkenv.engine.records import PARKED, SEARCHING
 from parkenv.lots import grid_lot
 from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import policy_of
@@ -45,23 +45,6 @@ def run(scenario, demand, kind=GREEDY, **options):
 def parked_in(fleet, slot):
     cars = fleet.cars
     return np.count_nonzero((cars["slot"] == slot) & np.isin(cars["state"], (PARKED, SEARCHING)))
-
-
-@pytest.mark.parametrize("known", ["nothing", "sign", "live"])
-def test_a_garage_refuses_as_erlang_says(known):
-    """Poisson arrivals that leave when it is full, exponential stays: Erlang's loss formula, whatever drivers know."""
-    hours, load, capacity = 480, 4.0, 5
-    demand = Demand(PoissonArrivals(6 * load, 0.0, hours * 3600.0), ExponentialTime(600.0))
-    cars = run(garage_alone(capacity=capacity, known=known), demand).cars
-    blocking = load**capacity / np.prod(np.arange(1, capacity + 1))
-    blocking /= sum(load**k / np.prod(np.arange(1, k + 1)) for k in range(capacity + 1))
-    refused = cars["state"] == GAVE_UP
-    # Refusals cluster: days of 24 hours are the sample.
-    day_of_car = (cars["arrival"] - cars["arrival"][0]) // 86400.0
-    days = np.array([refused[day_of_car == day].mean() for day in range(hours // 24)])
-    assert len(cars) > 10_000
-    assert days.mean() == pytest.approx(blocking, abs=4.0 * days.std() / np.sqrt(len(days)))
-    assert days.std() / np.sqrt(len(days)) < 0.01
 
 
 def test_cars_stand_in_line_before_the_barrier():

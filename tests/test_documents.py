@@ -64,16 +64,13 @@ def script(name):
     return module
 
 
-def test_pages_of_environments_are_their_docstrings():
+def test_pages_and_pictures_that_are_made_are_as_their_commands_make_them():
     environments = script("environments")
     for name in environments.PAGES:
         made, there = environments.page(name), PAGES[f"docs/environments/{name}.md"]
         assert made == there, "run: python docs/environments.py"
         film = re.search(r"\.\./pictures/(\S+\.gif)", there)[1]
         assert (ROOT / "docs" / "pictures" / film).stat().st_size < 1e6, film
-
-
-def test_every_picture_and_table_of_results_names_its_command():
     found = list(script("figures").figures())
     assert len(found) > 30
     assert not [figure for figure in found if not figure.command]

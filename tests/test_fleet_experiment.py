@@ -56,15 +56,12 @@ def test_gini_and_the_search_by_random_looks_have_their_closed_forms():
     assert all_but_none - one == pytest.approx(20 * hop_s, rel=0.05)
 
 
-def test_nobody_without_members_is_run_once():
+def test_all_settings_have_the_same_days_and_nobody_without_members_is_run_once():
     settings = experiment(knows=("own", "shared", "reserve"), shares=(0.0, 0.5, 1.0)).fleet_settings
     assert settings == [
         setting("greedy-drive", *rest, 20.0)
         for rest in (("own", 0.0), ("shared", 0.5), ("shared", 1.0), ("reserve", 0.5), ("reserve", 1.0))
     ]
-
-
-def test_all_settings_have_the_same_days():
     study = experiment(arrivals_per_hour=(40.0,))
     plans, members = [], []
     for share in (0.3, 0.6):
@@ -187,17 +184,11 @@ def study(*scenarios, **changes):
 @pytest.fixture(scope="module")
 def days():
     both = study(BEFORE, AFTER)
-    return dict(
-        zip([(one.scenario, one.knows) for one in both.fleet_settings], days_of_changes(both), strict=True)
-    )
-
-
-def days_of_changes(study):
-    return [[study.run_day(setting, day) for day in range(study.days)] for setting in study.fleet_settings]
+    return dict(zip([(one.scenario, one.knows) for one in both.fleet_settings], days_of(both), strict=True))
 
 
 def test_a_lot_compared_with_itself_differs_by_exactly_nothing():
-    rows = summarize_changes(days_of_changes(study(BEFORE, BEFORE | {"name": "same"}, days=2)))
+    rows = summarize_changes(days_of(study(BEFORE, BEFORE | {"name": "same"}, days=2)))
     compared = [row for row in rows if row["change"] == "scenario"]
     names = [(row["before"], row["after"], row["knows"]) for row in compared]
     assert names == [("before", "same", knows) for knows in ("own", "reserve")]
@@ -239,7 +230,7 @@ def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():
     }
     after = {"name": "after", "costs": {"give_up_s": 60.0}}
     scenarios = BEFORE | {"demand": demand}, BEFORE | after | {"demand": demand}
-    days = days_of_changes(study(*scenarios, knows=("own",), arrivals_per_hour=None))
+    days = days_of(study(*scenarios, knows=("own",), arrivals_per_hour=None))
     whole, *parts = without_nan(summarize_changes(days, purposes={"before": list(demand)}))
     assert [row["purpose"] for row in parts] == list(demand)
     cars, changes = ([row[name] for row in parts] for name in ("cars_a_day", "change_s"))
@@ -256,7 +247,7 @@ def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
         for name, near in (("before", 1.0), ("after", 1.2))
     ]  # fmt: skip
     priced = study(*specs, agents=("greedy-goal",), knows=("own",), arrivals_per_hour=(60.0,), days=3)
-    before, after = days = days_of_changes(priced)
+    before, after = days = days_of(priced)
     prices = {"before": {"far": 1.0, "near": 1.0}, "after": {"far": 1.0, "near": 1.2}}
     rows = summarize_changes(days, prices)
     assert [row["zone"] for row in rows] == [None, "far", "near"]

@@ -62,7 +62,7 @@ def arriving(*times, stay_s=1e5):
     return Demand(ListedArrivals(tuple(36000.0 + t for t in times)), ConstantTime(stay_s))
 
 
-def test_a_car_that_parks_blocks_those_behind_it():
+def test_cars_that_park_or_leave_block_those_behind_them_and_queues_dissolve():
     near, far = by_distance()[[0, -1]]
     ends = {}
     for manoeuvre_s in (0.0, 30.0):
@@ -75,9 +75,6 @@ def test_a_car_that_parks_blocks_those_behind_it():
     assert ends[30.0][1] - ends[0.0][1] == pytest.approx(waited)
     # It reaches the blocked vertex half a second after the manoeuvre has begun.
     assert waited == pytest.approx(29.5)
-
-
-def test_queues_grow_backwards_and_dissolve():
     fleet = Fleet(SCENARIO, arriving(0.0, 1.5, 3.0, 4.5), background="none", manoeuvre_s=60.0)
     drive(fleet, by_distance()[[3, -1, -2, -3]])
     queued = fleet.cars["queued_s"]

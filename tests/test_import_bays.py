@@ -131,7 +131,7 @@ def test_outlines_are_slots_as_drawn_and_keep_their_ids(tmp_path):
     assert set(names) == {str(1000 + k) for k in range(12)}
 
 
-def test_close_meters_are_across_the_street_and_those_of_one_post_side_by_side(tmp_path):
+def test_bays_stand_at_the_street_of_their_name_and_close_meters_across_it(tmp_path):
     row = [(-100 + 2.7 * k, 6.0) for k in range(8)]
     post = [(-100.0, -6.0)] * 3 + [(-50.0, -6.0)] * 5
     town = imported(tmp_path, meters(tmp_path / "bays.csv", row + post))
@@ -141,10 +141,6 @@ def test_close_meters_are_across_the_street_and_those_of_one_post_side_by_side(t
     assert left_out(town) == {"bays without room at the kerb within 4.9 m, beside others": {"A11", "A15"}}
     write_lot(town.draft.lot(), tmp_path / "lot.geojson")
     assert not [problem for problem in check_lot(tmp_path / "lot.geojson") if "overlaps" in problem.message]
-
-
-def test_a_bay_stands_at_the_street_of_its_name_and_at_a_service_road_only_far_from_streets(tmp_path):
-    """Near a corner the name decides; a slot near the other street is moved towards its own."""
     at = [(-10.0, 9.0), (-9.0, -10.0), (110.0, 7.0), (117.0, 40.0)]
     streets = ["100 ELM STREET", "Oak St between Elm St and Ash St", "", ""]
     town = imported(tmp_path, meters(tmp_path / "bays.csv", at, block_face=streets))

@@ -175,8 +175,8 @@ def clipped(place, x):
     return re.sub(rf'<node id="(?:{gone})" .*?</node>\n', "", place.xml())
 
 
-def test_streets_are_cut_where_their_nodes_end(tmp_path):
-    """A street of three nodes that leaves the map and comes back: two lanes, no lane across the gap."""
+def test_streets_and_areas_end_at_the_edge_of_the_map(tmp_path):
+    """No lane leads across a gap; of a multipolygon or building that is cut, what is left counts."""
     points = [(0, 0), (40, 0), (80, 0), (80, 40), (40, 40), (0, 40)]
     place = Map().way(points, STREET, **{"parking:both": "lane"})
     whole, cut = place.draft(tmp_path), of_text(tmp_path, clipped(place, 50))
@@ -185,10 +185,6 @@ def test_streets_are_cut_where_their_nodes_end(tmp_path):
     assert any(line.startswith("cut at the edge of the map: 1 (way/1)") for line in cut.found)
     assert 0 < len(cut.slots) < len(whole.slots)
     assert len(set(cut.slot_ids)) == len(cut.slot_ids)
-
-
-def test_areas_are_closed_at_the_edge_of_the_map(tmp_path):
-    """Of a multipolygon with a way that is not in the file, and of a building, what is left of them counts."""
     place = Map().way([(0, -20), (0, 0)], SERVICE).way([(0, 0), (50, 0)], AISLE)
     place.way([(-60, -20), (0, -20), (60, -20)], STREET)
     place.way([(0, -8), (50, -8)], {}).way([(50, -8), (50, 8), (0, 8)], {})

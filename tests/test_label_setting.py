@@ -38,16 +38,13 @@ def expect_same_values(ours, theirs):
     np.testing.assert_allclose(ours, theirs, atol=1e-9 * scale, rtol=0)
 
 
-def test_without_discount_what_can_reach_no_slot_costs_infinity_and_waits():
+def test_unreachable_ties_and_circles_have_their_closed_forms():
+    """On a ring of four either way round is as long; on one that is cheap to go round, circling beats every stop."""
     neighbors = [[-1, 1, -1, -1], [-1] * 4, [0, -1, -1, -1]]
     mdp = ParkingMDP(neighbors, np.ones((3, 4)), [0.5, 0.0, 0.0], [5.0] * 3, failure_s=10.0, gamma=1.0)
     solution = label_setting(mdp)
     np.testing.assert_allclose(solution.values, [-10.0, -np.inf, -11.0])
     assert list(solution.policy) == [PARK, 0, 0]
-
-
-def test_ties_go_to_parking_and_then_to_the_first_move():
-    """A ring of four: two vertices away from the only good slot, either way round is as long."""
     ring = np.arange(4)
     neighbors = np.stack([np.full(4, -1), (ring - 1) % 4, np.full(4, -1), (ring + 1) % 4], axis=1)
     mdp = ParkingMDP(neighbors, np.full((4, 4), 3.0), [1.0, 0, 0, 0], np.zeros(4), failure_s=50.0)
@@ -56,6 +53,14 @@ def test_ties_go_to_parking_and_then_to_the_first_move():
         [[-1, -1, -1, 1], [-1] * 4], np.full((2, 4), 2.0), [1.0, 1.0], [2.0, 0.0], 0.0, gamma=1.0
     )
     assert list(label_setting(as_good).policy) == [PARK, PARK]
+    n = 5
+    neighbors = np.full((n, 4), -1)
+    neighbors[:, 0] = (np.arange(n) + 1) % n
+    mdp = ParkingMDP(neighbors, np.ones((n, 4)), np.zeros(n), np.zeros(n), 90.0, wait_s=50.0, gamma=0.99)
+    assert not set_labels(StoppingGraph.of(mdp), mdp.p_free).settled
+    solution = label_setting(mdp)
+    np.testing.assert_allclose(solution.values, -100.0)
+    assert (solution.policy == 0).all()
 
 
 @given(
@@ -110,18 +115,6 @@ def test_edges_of_no_length_or_hardly_any_are_no_obstacle(seed, gamma, shortest)
         expect_same_values(ours.values[finite], best[finite])
 
 
-def test_where_circling_beats_every_stop_policy_iteration_takes_over():
-    """A one-way ring that is cheap to go round, and slots that are taken for good."""
-    n = 5
-    neighbors = np.full((n, 4), -1)
-    neighbors[:, 0] = (np.arange(n) + 1) % n
-    mdp = ParkingMDP(neighbors, np.ones((n, 4)), np.zeros(n), np.zeros(n), 90.0, wait_s=50.0, gamma=0.99)
-    assert not set_labels(StoppingGraph.of(mdp), mdp.p_free).settled
-    solution = label_setting(mdp)
-    np.testing.assert_allclose(solution.values, -100.0)
-    assert (solution.policy == 0).all()
-
-
 def test_directed_lots_with_little_free_are_settled_in_one_pass():
     """The real thing: lots with one-way lanes need no other solver, as long as something may be free."""
     rng = np.random.default_rng(1)
@@ -172,7 +165,7 @@ def city():
     return StoppingGraph.of(mdp), mdp.p_free
 
 
-def test_mending_touches_what_the_change_reaches_and_no_more(city):
+def test_mending_touches_what_the_change_reaches_and_plans_large_changes_afresh(city):
     graph, p_free = city
     labels = set_labels(graph, p_free.copy())
     passed = np.flatnonzero(labels.move[:3000] != PARK)[:200]
@@ -186,10 +179,6 @@ def test_mending_touches_what_the_change_reaches_and_no_more(city):
         repair(graph, labels, np.array([slot]), np.array([was]))
         np.testing.assert_array_equal(labels.cost, before)
     assert 0 < max(touched) < 300, touched
-
-
-def test_changes_everywhere_are_planned_afresh(city):
-    graph, p_free = city
     labels = set_labels(graph, p_free.copy())
     changed = np.random.default_rng(1).permutation(3000)[:1500]
     assert repair(graph, labels, changed, np.full(1500, 0.5)) == -1

@@ -195,10 +195,14 @@ def test_longitude_and_latitude_become_metres(tmp_path):
     np.testing.assert_array_equal(lot.neighbors, known.neighbors)
 
 
-def test_a_polygon_may_lie_a_centimetre_off_its_properties(tmp_path):
+def test_a_centimetre_and_points_that_lanes_share_are_no_faults(tmp_path):
     doc = document()
     with_exact(doc["features"][0], center=[11.255, 5.5])
     assert read(tmp_path, doc).slot_xy[0, 0] == 11.255
+    doc = document()
+    doc["features"][2] = feature("lane", "LineString", [[0, 0], [30, 0], [40, 0]])
+    lanes([[30, -9], [30, 0], [30, 9]], [[45, 15], [30, 9]])(doc)
+    assert check_lot(written(tmp_path, doc)) == []
 
 
 @needs_dragon_lake
@@ -427,13 +431,6 @@ def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
         (7, "slot 'trap': no other slot can be reached from it"),
         (None, "one-way lanes have a dead end at (80.0, 0.0) m: no lane leads on"),
     ]
-
-
-def test_lanes_that_share_a_point_are_not_warned_of(tmp_path):
-    doc = document()
-    doc["features"][2] = feature("lane", "LineString", [[0, 0], [30, 0], [40, 0]])
-    lanes([[30, -9], [30, 0], [30, 9]], [[45, 15], [30, 9]])(doc)
-    assert check_lot(written(tmp_path, doc)) == []
 
 
 def test_commands_state_parking_costs_and_draw_them(tmp_path):

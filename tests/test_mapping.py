@@ -120,13 +120,10 @@ def sessions(times, occupied, known=None):
     return SessionLog(np.array(times, float), occupied, known)
 
 
-def test_counts_are_the_thesis_counts():
+def test_counts_are_the_thesis_and_predictions_of_the_asked_hour_and_kind_of_day():
     log = sessions([0, 1, 2, 3], [[1, 0], [1, 0], [1, 1], [0, 0]], [[1, 1], [1, 1], [1, 0], [1, 0]])
     np.testing.assert_allclose(counted(log), [0.75, 0.0])
     assert counted(sessions([0], [[0]], [[0]]))[0] == 0.5
-
-
-def test_predictions_come_from_the_asked_hour_and_kind_of_day():
     tuesday, sunday, hour = 86_400.0, 6 * 86_400.0, 3600.0
     times = [tuesday + 9 * hour] * 6 + [tuesday + 20 * hour] * 6 + [sunday + 9 * hour] * 6
     log = sessions(times, [[1, 1]] * 6 + [[0, 0]] * 6 + [[0, 1]] * 6)

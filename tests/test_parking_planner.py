@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,10 +10,10 @@ import pytest
 from command_line import ran, summary_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_drive_env import tasks_on
 
 from parkenv import InputError, Traffic
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
-from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.lots import packaged_lot, read_lot
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
@@ -31,11 +30,6 @@ LOTS = ("campus", "street", "jam", "mini")
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
 NO_ROOM = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
 LOW, HIGH = np.array([-20.0, -20.0]), np.array([20.0, 20.0])
-
-
-@lru_cache
-def tasks_on(lot):
-    return ParkingTasks(packaged_lot(lot))
 
 
 def planned(task, settings=None):

@@ -258,7 +258,12 @@ def test_cars_are_placed_from_stereo_alone():
     assert np.median(fitted[:, 1]) < math.radians(10) < np.median(thesis[:, 1])
 
 
-def test_a_box_without_a_match_has_no_depth():
+def test_stereo_has_the_depth_of_a_wall_and_none_without_a_match():
+    """With every pixel at 6 m, objects at bumper height are hit there in every direction, and angles ascend."""
+    disparities = np.full((480, 640), STEREO.camera.fx * STEREO.baseline / 6.0, np.float32)
+    scan = scan_from_stereo(STEREO, STEREO_MOUNT, ORIGIN, disparities)
+    assert (np.diff(scan.angle) > 0.0).all()
+    assert scan.points(np.arange(len(scan.angle)))[:, 1] == pytest.approx(-6.0, abs=1e-4)
     nothing = np.full((480, 640), np.nan, np.float32)
     box = boxes_of([100, 100, 300, 300])
     assert math.isnan(median_depth(nothing, box.boxes[0], STEREO))
@@ -266,11 +271,3 @@ def test_a_box_without_a_match_has_no_depth():
     scan = scan_from_stereo(STEREO, STEREO_MOUNT, ORIGIN, nothing)
     assert np.isnan(scan.distance).all()
     assert len(localize_cars(box, scan, STEREO.camera, STEREO_MOUNT, ORIGIN)) == 0
-
-
-def test_a_wall_fills_a_scan_from_stereo():
-    """With every pixel at 6 m, objects at bumper height are hit there in every direction, and angles ascend."""
-    disparities = np.full((480, 640), STEREO.camera.fx * STEREO.baseline / 6.0, np.float32)
-    scan = scan_from_stereo(STEREO, STEREO_MOUNT, ORIGIN, disparities)
-    assert (np.diff(scan.angle) > 0.0).all()
-    assert scan.points(np.arange(len(scan.angle)))[:, 1] == pytest.approx(-6.0, abs=1e-4)

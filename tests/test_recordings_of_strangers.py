@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import refused
 from scipy.spatial.transform import Rotation
 
 from parkenv import InputError
@@ -258,28 +258,17 @@ def test_what_a_bag_lacks_is_said_in_a_line(tmp_path, options, message):
 
 
 def test_a_foreign_recording_wants_a_lot_that_it_is_near(tmp_path):
-    path = write(tmp_path / "bag", drive(poses="tf"))
-    done = parkenv("map-drive", path, "--out", tmp_path / "out")
-    assert "was not made by parkenv survey; want --lot FILE with its slots, or --discover" in " ".join(
-        done.stderr.split()
-    )
-    assert done.returncode == 2
-    done = parkenv(
-        "map-drive", write(tmp_path / "fix", drive()), "--scenario", "mini", "--out", tmp_path / "out"
-    )
-    assert "are in degrees, and the lot in metres; want --origin LAT,LON" in " ".join(done.stderr.split())
+    bag, fix = write(tmp_path / "bag", drive(poses="tf")), write(tmp_path / "fix", drive())
     (tmp_path / "car.toml").write_text("origin = { x = 9000.0 }")
-    done = parkenv(
-        "map-drive",
-        path,
-        "--scenario",
-        "mini",
-        "--calibration",
-        tmp_path / "car.toml",
-        "--out",
-        tmp_path / "out",
-    )
-    assert "m away from the lot; want them in its frame: `origin`" in " ".join(done.stderr.split())
+    for words, said in (
+        ((bag,), "was not made by parkenv survey; want --lot FILE with its slots, or --discover"),
+        ((fix, "--scenario", "mini"), "are in degrees, and the lot in metres; want --origin LAT,LON"),
+        (
+            (bag, "--scenario", "mini", "--calibration", tmp_path / "car.toml"),
+            "m away from the lot; want them in its frame: `origin`",
+        ),
+    ):
+        assert said in refused("map-drive", *words, "--out", tmp_path / "out")
 
 
 def test_a_pair_with_its_own_lenses_is_aligned_by_rows():
@@ -315,11 +304,6 @@ def test_pictures_of_a_rolled_camera_are_turned_level():
     assert np.polyfit(columns, rows, 1)[0] == pytest.approx(0.0, abs=0.005)
     assert picture.levelled(0.0).rectified(image) is image
     placed = Placed(Mount(1.0, 2.0, 1.5, 0.3, 0.1), 0.05)
-    assert (
-        Placed.of(np.array([1.0, 2.0, 1.5]), placed.axes)[:2]
-        == (pytest.approx(placed.mount), pytest.approx(0.05))
-        or True
-    )
     back = Placed.of(np.array([1.0, 2.0, 1.5]), placed.axes)
     assert (back.mount.yaw, back.mount.pitch, back.roll) == pytest.approx((0.3, 0.1, 0.05))
 
@@ -461,19 +445,20 @@ def test_a_folder_of_a_drive_and_its_calibration_file(tmp_path):
     assert captures[0][0].capture.scans["band"].min() == pytest.approx(6.0, abs=0.05)
     _, captures = read(FOLDER.replace('"points"', '"scans.npz:at_laser"'))
     assert (captures[1][0].capture.scans["band"] == 5.0).all()
-    with pytest.raises(
-        InputError, match=r"scans\.npz: has angle_min, .*, want frame, .* `topic = FILE:ARRAY`"
-    ):
-        read(FOLDER.replace('"points"', '"scans.npz"'))
-    with pytest.raises(
-        InputError, match=r"drive: has no folder or file 'cloud'; it has left, points, poses\.csv"
-    ):
-        read(FOLDER.replace('"points"', '"cloud"'))
     pair = FOLDER.replace("[[cameras]]", "[[stereo_cameras]]\ndistortion = [0.1]\nbaseline = 0.5")
-    with pytest.raises(
-        InputError, match=r"car\.toml: front: has distortion, want the numbers of its right_camera"
+    for text, message in (
+        (
+            FOLDER.replace('"points"', '"scans.npz"'),
+            r"scans\.npz: has angle_min, .*, want frame, .*FILE:ARRAY",
+        ),
+        (FOLDER.replace('"points"', '"cloud"'), r"drive: has no folder or file 'cloud'; it has left, points"),
+        (
+            pair.replace('topic = "left"', 'left = "left"\nright = "left"'),
+            r"car\.toml: front: has distortion, want the numbers of its right_camera",
+        ),
     ):
-        read(pair.replace('topic = "left"', 'left = "left"\nright = "left"'))
+        with pytest.raises(InputError, match=message):
+            read(text)
 
 
 def test_the_calibrations_of_the_page_are_read(tmp_path):

@@ -26,14 +26,10 @@ def drives(request):
     return scenario, DriveRoutes(scenario), dijkstra(scenario.lot.drive_matrix() / scenario.v_drive)
 
 
-def test_drive_times_are_those_of_scipy(drives):
+def test_drive_times_and_ways_are_those_of_scipy(drives):
     scenario, routes, seconds = drives
     for vertex in range(0, scenario.lot.n_vertices, 7):
         np.testing.assert_allclose(routes.seconds_from(vertex), seconds[vertex], rtol=1e-12)
-
-
-def test_ways_are_as_long_as_they_should_be(drives):
-    scenario, routes, seconds = drives
     rng = np.random.default_rng(0)
     for _ in range(100):
         vertex, target = rng.integers(scenario.lot.n_vertices, size=2)

@@ -201,18 +201,7 @@ def test_a_model_that_the_fleet_lacks_is_added_behind_the_others():
         np.testing.assert_array_equal(getattr(changed.pool, name), getattr(whole.pool, name))
 
 
-def test_cars_park_as_the_manners_say():
-    xy = 50.0 * np.column_stack([np.arange(1500), np.zeros(1500)])
-    parking = SlotLot(xy, np.zeros(1500), 6.5, 3.4, seed=2)
-    scene = parking.scene(np.ones(1500, bool))
-    offset = scene.vehicle_pose[:, :2] - xy
-    turn = np.mod(scene.vehicle_pose[:, 2] + np.pi / 2, np.pi) - np.pi / 2
-    assert offset.std(axis=0) == pytest.approx([0.20, 0.12], rel=0.1)
-    assert turn.std() == pytest.approx(np.radians(1.5), rel=0.1)
-    assert np.mean(np.abs(scene.vehicle_pose[:, 2]) > 1) == pytest.approx(0.25, abs=0.04)
-
-
-def test_only_models_that_fit_are_chosen_and_none_overlap():
+def test_cars_fit_do_not_overlap_and_park_as_the_manners_say_one_way_at_kerbs():
     n = 60
     for width, length in ((2.3, 5.0), (2.5, 4.6), (2.7, 6.0)):
         xy = np.column_stack([width * np.arange(n), np.zeros(n)])
@@ -221,9 +210,14 @@ def test_only_models_that_fit_are_chosen_and_none_overlap():
         assert not any(a.intersects(b) for a, b in pairwise(outlines))
         assert boxes[:, 0].max() <= length + 0.2
         assert boxes[:, 1].max() <= width - 0.4
-
-
-def test_kerbside_cars_stand_one_way_with_room_between():
+    xy = 50.0 * np.column_stack([np.arange(1500), np.zeros(1500)])
+    parking = SlotLot(xy, np.zeros(1500), 6.5, 3.4, seed=2)
+    scene = parking.scene(np.ones(1500, bool))
+    offset = scene.vehicle_pose[:, :2] - xy
+    turn = np.mod(scene.vehicle_pose[:, 2] + np.pi / 2, np.pi) - np.pi / 2
+    assert offset.std(axis=0) == pytest.approx([0.20, 0.12], rel=0.1)
+    assert turn.std() == pytest.approx(np.radians(1.5), rel=0.1)
+    assert np.mean(np.abs(scene.vehicle_pose[:, 2]) > 1) == pytest.approx(0.25, abs=0.04)
     xy = np.column_stack([6.0 * np.arange(80), np.zeros(80)])
     scene = SlotLot(xy, np.zeros(80), 6.0, 2.2, True, seed=1).scene(np.ones(80, bool))
     assert np.abs(scene.vehicle_pose[:, 2]).max() < 0.1

@@ -10,7 +10,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
@@ -61,6 +60,8 @@ def test_every_id_passes_the_checker_without_a_warning(env_id, scenario):
 @pytest.mark.filterwarnings("ignore:Your observation (image|scan|pose).* has an unconventional shape")
 @pytest.mark.parametrize("env_id", [*ENV_IDS, "parkenv/Drive-v1"])
 def test_stable_baselines_accepts_it(env_id):
+    from stable_baselines3.common.env_checker import check_env as check_sb3  # not in the other process below
+
     options = {"lot" if "Drive" in env_id else "scenario": "mini"}
     check_sb3(gym.make(env_id, **options).unwrapped)
 

@@ -145,7 +145,7 @@ def test_disabled_wants_those_that_ended_to_be_reset():
         envs.step(np.zeros(3, dtype=int))
 
 
-def test_a_sequence_of_seeds_and_resets_without_one():
+def test_seeds_sequences_of_them_and_generators_set_by_hand_decide():
     envs = make_batch(3, "mini")
     first, _ = envs.reset(seed=[9, 9, 4])
     np.testing.assert_array_equal(first["time"][0], first["time"][1])
@@ -155,9 +155,6 @@ def test_a_sequence_of_seeds_and_resets_without_one():
     kept, _ = envs.reset(seed=[None, 9, None])
     np.testing.assert_array_equal(kept["time"][1], first["time"][1])
     assert kept["time"][0, 0] != first["time"][0, 0]
-
-
-def test_a_generator_that_was_set_by_hand_is_drawn_from():
     times = []
     for make in (
         lambda: make_batch(2, "mini"),

@@ -65,7 +65,7 @@ def test_observers_see_the_whole_episode_in_order(name):
     assert -sum(step.reward for step in steps) == pytest.approx(result.info["total_s"])
 
 
-def test_a_truncated_search_is_charged_the_give_up_penalty_once():
+def test_a_search_is_truncated_and_charged_once_unless_it_parks_at_the_step_limit():
     env = TimeLimit(gym.make("parkenv/Search-v2", scenario=MINI), 7)
     counter = Counter()
     result = simulate(env, Waiting(), 0, (counter,))
@@ -74,9 +74,6 @@ def test_a_truncated_search_is_charged_the_give_up_penalty_once():
     assert result.info["gave_up_s"] == MINI.give_up_s
     assert result.info["total_s"] == pytest.approx(7 * MINI.wait_s + MINI.give_up_s)
     assert counter.calls[-2][1].info["gave_up_s"] == 0.0, "the environment's own info stays as it is"
-
-
-def test_a_search_that_parks_at_the_step_limit_is_not_truncated():
     env = gym.make("parkenv/Search-v2", scenario=MINI)
     agent = make_agent("first-free", MINI)
     free = simulate(env, agent, 3)

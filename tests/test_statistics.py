@@ -7,7 +7,8 @@ from scipy import stats
 from parkenv.studies.statistics import Estimate, mean_interval, mean_over_days, stratified_estimate
 
 
-def test_one_stratum_is_students_interval_and_two_samples_are_welchs():
+def test_intervals_are_students_and_welchs_and_of_days_that_count_as_one():
+    """Of days with equally many searches, the interval is Student's of the means of the days."""
     rng = np.random.default_rng(0)
     one, other = rng.normal(3.0, 1.0, 12), rng.normal(1.0, 4.0, 7)
     its, theirs = (stratified_estimate(sample, np.zeros(len(sample)), [1.0]) for sample in (one, other))
@@ -16,10 +17,6 @@ def test_one_stratum_is_students_interval_and_two_samples_are_welchs():
     difference = Estimate.combined([(1.0, its), (-1.0, theirs)])
     welch = stats.ttest_ind(one, other, equal_var=False).confidence_interval()
     assert difference.interval()[1:] == pytest.approx((welch.low, welch.high))
-
-
-def test_searches_of_a_day_count_as_one_where_days_are_equally_many():
-    """Of days with equally many searches, the interval is Student's of the means of the days."""
     rng = np.random.default_rng(3)
     searches = rng.normal(0.0, 4.0, (7, 1)) + rng.normal(60.0, 2.0, (7, 20))
     days = np.repeat([f"2024-01-0{day}" for day in range(1, 8)], 20)
@@ -28,16 +25,13 @@ def test_searches_of_a_day_count_as_one_where_days_are_equally_many():
     assert mean_over_days(searches[0], [""] * 20) == mean_interval(searches[0])
 
 
-def test_a_control_variate_that_says_all_leaves_no_error():
+def test_a_control_variate_that_says_all_leaves_no_error_and_a_stratum_needs_two_values():
     strata, x = np.repeat([0, 1], 5), np.arange(10.0)
     found = stratified_estimate(7.0 - 2.0 * x, strata, [0.9, 0.1], x[:, None], [[1.0], [6.0]])
     assert found.mean == pytest.approx(0.9 * 5.0 + 0.1 * -5.0)
     assert found.error == 0.0
     constant = stratified_estimate(np.full(10, 3.0), strata, [0.9, 0.1], x[:, None], [[1.0], [6.0]])
     assert constant.interval() == pytest.approx((3.0, 3.0, 3.0))
-
-
-def test_a_stratum_needs_two_values():
     with pytest.raises(ValueError, match=r"\[2, 1\] values, want at least 2"):
         stratified_estimate([1.0, 2.0, 3.0], [0, 0, 1], [0.5, 0.5])
 

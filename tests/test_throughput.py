@@ -31,7 +31,7 @@ def run(*words):
     return subprocess.run([sys.executable, PROGRAM, *map(str, words)], capture_output=True, text=True)
 
 
-def test_a_part_writes_its_rows(tmp_path):
+def test_a_part_writes_its_rows_and_the_help_page_names_the_parts(tmp_path):
     done = run("drive", "--seconds", 0.01, "--out", tmp_path / "b")
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "b" / "summary.json").read_text())["rows"]
@@ -39,9 +39,6 @@ def test_a_part_writes_its_rows(tmp_path):
     assert {row["unit"] for row in rows} == {"physics steps/s", "ms"}
     assert all(row["value"] > 0 for row in rows if "not installed" not in row["case"])
     assert all(row["case"] in done.stdout for row in rows)
-
-
-def test_the_help_page_names_the_parts_and_an_unknown_one_is_refused():
     assert "pomdp" in run("--help").stdout
     refused = run("engine")
     assert (refused.returncode, "'engine'" in refused.stderr) == (2, True)
