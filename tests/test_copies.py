@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from test_search_vector import recorded_scenario
+from test_search_reference import recorded_scenario
 from test_sensors_env import SMALL_RIG
 
 import parkenv

@@ -14,7 +14,7 @@ from gymnasium.wrappers import RecordVideo
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from pictures import shows_color
-from test_misuse import OPTIONS
+from test_make_options import OPTIONS
 
 import parkenv  # noqa: F401  (registers the environments)
 from parkenv import make_scenario
