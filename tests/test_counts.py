@@ -198,43 +198,6 @@ def test_car_parks_without_use_are_named(tmp_path):
     }  # fmt: skip
 
 
-HEADER = "car_park,capacity,hour,free\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (
-            "a,b\n1,2\n",
-            "'a, b', of neither .*: want a column of times .*; a column of free .*; the number of places",
-        ),
-        ("Zeit;frei\n", "'Zeit, frei', want the number of places .a column capacity, or --capacity"),
-        ("Zeit;Kapazität\n", "'Zeit, Kapazität', want a column of free or taken places"),
-        ("time,zeit,free,capacity\n", "'time' and 'zeit' say the same"),
-        ("hour,time,free,capacity\n", "several columns of times"),
-        ("datum;frei;capacity\n01.03.2024;3;9\n", "line 2: datum is '01.03.2024', want a time such as"),
-        (
-            "zeit;frei;capacity\n01/03/2024 07:00;3;9\n",
-            "line 2: zeit is '01/03/2024 07:00', want a time such as",
-        ),
-        ("zeit;frei;capacity\n01.03.2024 07:00;1.203;1600\n", "has the number '1.203', want whole numbers"),
-        ('time,free,capacity\n2024-03-01 07:00,"1,203",1600\n', "line 2: free is '1,203', want a number"),
-        (HEADER, "has no readings"),
-        ("", "is empty, want a table"),
-        (HEADER + "a,100,yesterday,5\n", "line 2: hour is 'yesterday', want a time such as"),
-        (HEADER + "a,100,2024-01-01,5\n", "line 2: hour is .*, want a time such as"),
-        (HEADER + "a,100,2024-01-01T00,five\n", "line 2: free is 'five', want a number"),
-        (HEADER + "a,100,0001-01-01T00,5\na,100,9999-12-31T00,5\n", "over 3,652,059 days, want at"),
-        (HEADER + "\x1bred,100,2024-01-01T00,5\n", "want a printable name"),
-    ],
-)
-def test_other_files_are_refused(tmp_path, text, message):
-    path = tmp_path / "counts.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=message):
-        Counts.read(path)
-
-
 def test_names_zones_and_capacities_that_do_not_fit_are_refused(tmp_path):
     counts = read(tmp_path, rows_of(free_places(2)))
     assert is_counts(tmp_path / "counts.csv")

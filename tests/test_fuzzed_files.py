@@ -3,6 +3,7 @@
 import contextlib
 import json
 import random
+import re
 import shutil
 import tempfile
 import tomllib
@@ -14,10 +15,12 @@ import cv2
 import numpy as np
 import pytest
 from file_mutations import mutated_bytes, mutated_json, mutated_text
+from lot_checks import refusal
 from made_maps import car_park
 
 from parkenv import InputError, OccupancyLog, OccupancyProcess, SensorModel, make_scenario
 from parkenv.files.images import read_image
+from parkenv.forecast.counts import Counts
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.mapping.store import MapStore, Session
@@ -310,3 +313,24 @@ def test_a_map_whose_schema_is_no_text_is_refused(tmp_path):
     good = FORMATS["map.sqlite"].good
     assert good.count(b"key TEXT") == 1
     read_or_refuse("map.sqlite", good.replace(b"key TEXT", b"k\xffy TEXT"), tmp_path)
+
+
+BAD = json.loads(Path(__file__).with_name("bad_files.json").read_text(encoding="utf-8"))
+"""Names and texts of files that are refused, and what is said of each; `…` stands for any words."""
+READERS = {
+    "scenario.toml": make_scenario,
+    "counts.csv": Counts.read,
+    "slots.csv": import_lot,
+    "map.yml": read_lot,
+}
+
+
+@pytest.mark.parametrize(("name", "text", "said"), BAD)
+def test_bad_files_are_refused_in_a_line_with_what_was_wanted(tmp_path, name, text, said):
+    path = tmp_path / name
+    path.write_text(text)
+    line = refusal(READERS[name], path)
+    assert line.startswith(f"{path}: ")
+    assert re.search(".*".join(map(re.escape, said.split(" … "))), line)
+    if name in ("slots.csv", "map.yml"):
+        assert "error" in {problem.severity for problem in check_lot(path)}

@@ -516,27 +516,3 @@ def test_parking_costs_and_zones_stay_with_their_slots(tmp_path):
         for column, values in (("slot_parking_cost_s", cost), ("slot_zone", zone)):
             listed = dict(zip(lot.slot_ids, values, strict=True))
             assert getattr(drawn, column).tolist() == [listed[name] for name in drawn.slot_ids]
-
-
-LIST_FAULTS = [
-    ("", "no slot below the line of columns"),
-    ("x,y", "no slot below the line of columns"),
-    ("x,y,lat,lon\n1,2,3,4", "columns are 'x,y,lat,lon'"),
-    ("x,x,y\n1,1,2", "line 1: has two columns 'x'"),
-    ("x,y,z\n1,1,2", "row 2: unknown key 'z'"),
-    ("x,y\n1,2\n3", "line 3: has 1 fields, want 2"),
-    ("x,y\n1,2\n3,nan", "row 3: y is 'nan', want"),
-    ("lat,lon\n91,2", "row 2: lat is '91', want a number of at most 90"),
-    ("x,y,yaw\n1,2,", "row 2: yaw is '', want a number"),
-    ("x,y,parking_cost_s\n1,2,-3", "row 2: parking_cost_s is '-3', want a number of at least 0"),
-    ("id,x,y\na,1,2\na,9,2", "row 3: id 'a' appears already in row 2"),
-    ("id,x,y\n,1,2", "row 2: id is '', want"),
-    ("x,y\n1,2\n9,9\n1.01,2", "row 4: slot '4' lies where slot '2' is"),
-]
-
-
-@pytest.mark.parametrize(("text", "message"), LIST_FAULTS, ids=map(str, range(len(LIST_FAULTS))))
-def test_faults_of_lists_are_named_in_one_line(tmp_path, text, message):
-    path = tmp_path / "slots.csv"
-    path.write_text(text)
-    assert re.search(message, refused_lot(import_lot, path))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from command_line import ran, summary_of
 from gymnasium.utils.env_checker import check_env
-from lot_checks import refusal
 from small_lots import CAR_PARKS
 from small_trainings import make_small, search_training
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
@@ -183,37 +182,6 @@ def test_logs_and_maps(tmp_path):
         occupancy = make_scenario(spec).occupancy
         assert occupancy.days_in(ArrivalWindow()) == ["2016-01-22"]
         assert occupancy.log.days[3:] == ("2016-01-22", "2016-01-23", "2016-01-24")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('lot = "mini"\n[costs]\nfailre_s = 5', "unknown key 'failre_s' in [costs]; did you mean 'failure_s'? known: "),
-        ('lto = "mini"', "unknown key 'lto'; did you mean 'lot'? known: name, lot, goal"),
-        ("goal = 0", "lot is missing"),
-        ('lot = "nowhere.geojson"', "lot.file is 'nowhere.geojson', want a file; there is none at /"),
-        ('lot = "campsu"', "lot is 'campsu', want a packaged lot (campus, jam, street, mini, town, kerbs) or a"),
-        ('lot = { name = "mini", grid = { rows = 1, columns = 2 } }', "want exactly one of name, file, grid, city"),
-        ('lot = "mini"\nspeeds = { v_walk_kmh = -4 }', "speeds.v_walk_kmh is -4, want a number of at least 0.1"),
-        ('lot = "mini"\ncosts = { failure_s = nan }', "costs.failure_s is nan, want a finite number"),
-        ("lot = { city = { slots = 1000000000 } }", "lot.city.slots is 1000000000, want a number of at most 1000000"),
-        ('lot = "mini"\ngoal = 7', "goal is 7, want an index from 0 to 0"),
-        ('lot = "mini"\ngoal = [1.0]', "goal is [1.0], want the index of one of the lot's goals, or a point [x, y]"),
-        ('lot = "mini"\noccupancy = "busy"', "occupancy is 'busy', want typical, real-week, a process (.json)"),
-        ('lot = "mini"\noccupancy = { mapping = "mine.toml" }', "want mapping only together with a log"),
-        ('lot = "mini"\noccupancy = { replay_from = 2016 }', "occupancy.replay_from is 2016, want a date such as"),
-        ('lot = "mini"\noccupancy = { day_error = -1 }', "occupancy.day_error.level is -1"),
-        ('lot = "mini"\noccupancy = { log = "mine.toml", day_error = 1 }', "day_error only without a log or counts"),
-        ('lot = "mini"\noccupancy = { log = "no.csv" }', "occupancy.log.0 is 'no.csv', want a file; there is none at"),
-        ('lot = "mini"\nsensor_model = { hit_rate = 0.5 }', "want hit_rate and false_alarm_rate together"),
-        ('lot = "mini"\nname = "a/b"', "name is 'a/b', want at most 80 printable characters without comma or slash"),
-        ('lot = "mini', "not TOML: "),
-    ],
-)  # fmt: skip
-def test_bad_files_are_refused_in_one_line(tmp_path, text, message):
-    line = refusal(make_scenario, written(tmp_path, text))
-    assert line.startswith(f"{tmp_path / 'mine.toml'}")
-    assert message in line
 
 
 def grids(n, seed):
