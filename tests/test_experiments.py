@@ -118,33 +118,6 @@ def test_agents_with_options_are_read_from_words_and_tables():
             parse_call(text)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('scenarios = ["own.toml"]', "own.toml: unknown key 'failre_s' in [costs]; did you mean 'failure_s'?"),
-        ("episods = 3", "bad.toml: unknown key 'episods'; did you mean 'episodes'? known: "),
-        ("[grid]\nfailure = 3", "unknown key 'failure' in [grid]; did you mean 'failure_s'?"),
-        ('scenarios = [{ lot = "mini", cost = {} }]', "unknown key 'cost' in [scenarios.0]; did you mean 'costs'?"),
-        ('scenarios = ["campsu"]', "scenarios.0: unknown scenario "),
-        ('scenarios = [{ lot = "none.geojson" }]', "scenarios.0.lot.file is 'none.geojson', want a file"),
-        ('scenarios = ["mini", "mini"]', "scenarios has 'mini' twice"),
-        ('agents = "mdp"', "agents is 'mdp', want a list"),
-        ("agents = [{ nam = 'mdp' }]", "agents.0.name is missing"),
-        ("agents = ['mdp(failre_s=9)']", "agent 'mdp' has no option 'failre_s'"),
-        ("agents = ['belief']\ngrid = { blind = true }", "all agents plan on observations: belief"),
-        ("grid = { v_walk_kmh = [4, -4] }", "grid.v_walk_kmh.1 is -4, want a number of at least 0.1"),
-        ("grid = { failure_s = [nan] }", "grid.failure_s.0 is nan, want a finite number"),
-        ("grid = { failure_s = [1, 1] }", "grid.failure_s is [1, 1], want different values; 1.0 is repeated"),
-        ("kind = 'comparison'", "kind is 'comparison'; did you mean 'compare'?"),
-        ("kind = { a = 1 }", "kind is {'a': 1}; "),
-        ("backend = 'spark'", "backend is 'spark', want 'loky', 'ray' or 'dask'"),
-    ],
-)  # fmt: skip
-def test_bad_files_are_refused_in_one_line(tmp_path, text, message):
-    (tmp_path / "own.toml").write_text('lot = "mini"\ncosts = { failre_s = 5 }\n')
-    assert message in refusal(tmp_path, text)
-
-
 def test_a_grid_without_bounds_is_refused_before_any_work(tmp_path):
     axis = list(range(1, 1001))
     speeds = f"v_walk_kmh = {[v / 10 for v in axis]}\nv_drive_kmh = {[v / 5 for v in axis]}"

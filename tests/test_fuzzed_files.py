@@ -20,6 +20,7 @@ from made_maps import car_park
 
 from parkenv import InputError, OccupancyLog, OccupancyProcess, SensorModel, make_scenario
 from parkenv.files.images import read_image
+from parkenv.files.limited_reading import read_json, read_toml, read_yaml
 from parkenv.forecast.counts import Counts
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import ImportOptions
@@ -33,6 +34,7 @@ from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.fleet.tables import CHANGES
 from parkenv.studies.report import RunFolder
 from parkenv.studies.results import DECISIONS, EPISODES, Results, decision_s
+from parkenv.studies.study import read_study
 
 MINI = packaged_lot("mini")
 ROOT = Path(__file__).parents[1] / "parkenv"
@@ -319,9 +321,13 @@ BAD = json.loads(Path(__file__).with_name("bad_files.json").read_text(encoding="
 """Names and texts of files that are refused, and what is said of each; `…` stands for any words."""
 READERS = {
     "scenario.toml": make_scenario,
+    "experiment.toml": lambda path: read_study(path).check(),
     "counts.csv": Counts.read,
     "slots.csv": import_lot,
     "map.yml": read_lot,
+    "file.json": read_json,
+    "file.toml": read_toml,
+    "file.yml": read_yaml,
 }
 
 
@@ -329,8 +335,10 @@ READERS = {
 def test_bad_files_are_refused_in_a_line_with_what_was_wanted(tmp_path, name, text, said):
     path = tmp_path / name
     path.write_text(text)
+    (tmp_path / "own.toml").write_text('lot = "mini"\ncosts = { failre_s = 5 }\n')
     line = refusal(READERS[name], path)
-    assert line.startswith(f"{path}: ")
+    assert line.startswith(f"{path}: ") or name == "experiment.toml"
+    assert len(line) < 500
     assert re.search(".*".join(map(re.escape, said.split(" … "))), line)
     if name in ("slots.csv", "map.yml"):
         assert "error" in {problem.severity for problem in check_lot(path)}

@@ -59,9 +59,6 @@ def png(width, height, rows=b""):
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*its) for its in chunks.items())
 
 
-BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
-    f"{new}: &{new} [{','.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
-)
 DEEP = 100_000
 
 
@@ -70,21 +67,10 @@ DEEP = 100_000
     [
         (read_json, "[" * DEEP, "not JSON: nested deeper than 200 levels"),
         (read_json, '{"a":' * DEEP, "not JSON: nested deeper than 200 levels"),
-        (read_json, "1" * 400, "a number of more than 300 digits"),
-        (read_json, '"\\ud800"', "not JSON"),
         (read_json, b"\xff\xfe", "not UTF-8 text"),
-        (read_json, "", "not JSON"),
         (read_toml, "a = " + "[" * DEEP, "not TOML: nested deeper"),
-        (read_toml, "a = " + "[" * 150 + "]" * 150, "nested deeper than 100"),
         (read_toml, ".".join("a" * DEEP) + " = 1", "not TOML: nested deeper"),
-        (read_toml, "a = 0x" + "f" * 40, "an integer above"),
-        (read_yaml, BOMB, "not YAML: aliases (*name) are not read"),
         (read_yaml, "[" * DEEP, "not YAML: nested deeper than 100 levels"),
-        (read_yaml, "a: 2015-13-45", "not YAML: month must be"),
-        (read_yaml, "a: 2015-11-12", "has a date (datetime.date(2015, 11, 12)), want text or a number"),
-        (read_yaml, '"\\uD800"', "text that is not Unicode"),
-        (read_yaml, "? {a: 1}\n: 2", "not YAML"),
-        (read_yaml, "!!python/object:os.system {}", "not YAML"),
     ],
 )
 def test_a_text_that_is_too_deep_or_damaged_is_refused(tmp_path, read, content, message):
