@@ -19,8 +19,10 @@ from lot_checks import refusal
 from made_maps import car_park
 
 from parkenv import InputError, OccupancyLog, OccupancyProcess, SensorModel, make_scenario
+from parkenv.driving.scene_files import read_scene
 from parkenv.files.images import read_image
 from parkenv.files.limited_reading import read_json, read_toml, read_yaml
+from parkenv.files.tracks import read_track
 from parkenv.forecast.counts import Counts
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import ImportOptions
@@ -328,6 +330,9 @@ READERS = {
     "file.json": read_json,
     "file.toml": read_toml,
     "file.yml": read_yaml,
+    "track.gpx": read_track,
+    "poses.csv": read_track,
+    **dict.fromkeys(("scene.csv", "scene.json", "scene.toml", "scene.geojson"), read_scene),
 }
 
 

@@ -207,52 +207,20 @@ def test_levels_are_drawn_for_a_car_in_a_file_and_a_run_says_it_again(tmp_path):
     assert first.read_bytes() == second.read_bytes()
 
 
-CROSSED = [[0.0, 5.0], [2.0, 7.0], [2.0, 5.0], [0.0, 7.0]]
-BAD = {
-    "crossing.csv": (tpcap_text(START, TARGET, [CROSSED]), "no simple polygon: Self-intersection[1 6]"),
-    "inside.csv": (
-        tpcap_text(START, TARGET, [[[0, -1], [3, -1], [3, 1], [0, 1]]]),
-        f"target is [{TARGET[0]}, 0.0, 0.0]: the car",
-    ),
-    "touching.csv": (
-        tpcap_text(START, TARGET, [[[0, 2], [3, 2], [3, 4], [0, 4]]]),
-        "start is [1.0, 3.0, 0.0]: the car",
-    ),
-    "nan.csv": (tpcap_text((math.nan, 0.0, 0.0), TARGET, BLOCKS), "not finite"),
-    "short.csv": ("0,0,0,9,0,0,2,4,4,1,1", "want start and target"),
-    "many.csv": ("0,0,0,9,0,0,1,1000000," + "1.0," * 2_000_000, "want at most"),
-    "prose.csv": ("a scene,of words", "is no scene"),
-    "other.json": ('{"Frames": {"0": {}}}', "no scene of ParkBench"),
-    "nan.json": (json.dumps(parkbench_content([[[math.nan, 1.0], [2.0, 2.0]]])), "not JSON"),
-    "open.toml": ("start = [0.0, 0.0, 0.0]", "target is missing"),
-    "short.toml": (own_text(start=[0.0, 1.0]), "start"),
-    "car.toml": (own_text(vehicle="tank"), "vehicle is 'tank'"),
-    "truck.toml": (own_text(vehicle=0).replace("vehicle = 0", "vehicle = {lenght = 5.0}"), "'lenght'"),
-    "degrees.toml": (
-        own_text(target=[1.4, 0.0, 90.0]),
-        "target is [1.4, 0.0, 90.0]: its yaw is beyond ±2π, want radians",
-    ),
-    "degrees.csv": (tpcap_text((1.0, 3.0, -180.0), TARGET, BLOCKS), "-180° are -3.1416 rad"),
-    "outside.toml": (
-        own_text(bounds=[50.0, 0.0, 60.0, 9.0]),
-        "start is [1.0, 3.0, 0.0]: the car reaches beyond",
-    ),
-    "turned.toml": (own_text(bounds=[9.0, 9.0, -9.0, -9.0]), "want smallest x and y, then largest"),
-    "far.toml": (own_text(target=[1e7, 0.0, 0.0]), "want a manoeuvre of 500 m at most"),
-    "features.json": ('{"features": 3}', "features is 3, want a list"),
-    "hole.geojson": ('{"features": [{"geometry": {"type": "Point", "coordinates": [1, 2]}}]}', "features.0"),
-    "empty": (None, "is not there"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
-    text, wanted = BAD[name]
-    if text is not None:
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("many.csv", "0,0,0,9,0,0,1,1000000," + "1.0," * 2_000_000, "want at most"),
+        ("empty", "", "is not there"),
+    ],
+    ids=["many", "empty"],
+)
+def test_a_bad_scene_is_one_line_and_nothing_is_written(tmp_path, name, text, said):
+    if text:
         (tmp_path / name).write_text(text)
-    said = refused("park --out out --cases", name, cwd=tmp_path)
-    assert wanted in said
-    assert name in said
+    line = refused("park --out out --cases", name, cwd=tmp_path)
+    assert said in line
+    assert name in line
     assert not (tmp_path / "out").exists()
 
 
