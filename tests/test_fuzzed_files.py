@@ -33,7 +33,6 @@ from parkenv.scenarios.calibration import Calibration
 from parkenv.show.report.page import write_page
 from parkenv.studies.benchmark.suite import Suite, check_result
 from parkenv.studies.compare.comparison import Comparison
-from parkenv.studies.fleet.tables import CHANGES
 from parkenv.studies.report import RunFolder
 from parkenv.studies.results import DECISIONS, EPISODES, Results, decision_s
 from parkenv.studies.study import read_study
@@ -150,14 +149,8 @@ failure_s = 10.0
 [traffic]
 cars = 2
 """
-EXPERIMENT = {
-    "kind": "compare",
-    "agents": ["mdp", "mdp(failure_s=20)"],
-    "scenarios": ["mini", {"name": "x", "lot": "jam", "speeds": {"v_walk_kmh": 3.0}}],
-    "episodes": 3,
-    "seed": 1,
-    "grid": {"failure_s": [10.0, 20.0], "occupancy_levels": [0.5]},
-}
+GOOD = json.loads(Path(__file__).with_name("good_files.json").read_text(encoding="utf-8"))
+SUMMARY = GOOD["summary.json"]
 MODEL = json.loads((ROOT / "world" / "sensor_models" / "laser.json").read_text())
 _HOURS = np.full(168, 1e-4)
 PROCESS = json.loads(written(OccupancyProcess(np.ones(3), _HOURS, np.ones(3), _HOURS).to_file))
@@ -176,50 +169,6 @@ RESULT = {
     ],
     "episodes": {"mdp": {t.name: SEARCHES for t in SUITE.tasks}},
 }  # fmt: skip
-INTERVALS = {name: [0.0, 60.0] for name in ("total_s_ci95", "difference_s_ci95", "regret_s_ci95")}
-SUMMARY_ROW = dict.fromkeys(
-    ("failure_cost_s", "v_walk_kmh", "v_drive_kmh", "median_s", "difference_s", "failed_s", "walk_s", "parking_cost_s",
-     "gave_up_s", "bound_s", "failed_parks", "replans", "regret_s", "decision_ms", "decision_ms_p99"), 1.0,
-) | INTERVALS | {
-    "scenario": "mini", "occupancy_level": None, "agent": "mdp", "episodes": 2, "parked_fraction": 1.0,
-    "truncated_fraction": 0.0, "gave_up_fraction": 0.0, "leads": True, "total_s": 50.0, "drive_s": 30.0,
-}  # fmt: skip
-SUMMARY = {
-    "command": ["parkenv", "compare", "--episodes", "2"], "version": "0.1.0", "seed": 0,
-    "rows": [SUMMARY_ROW, SUMMARY_ROW | {"agent": "random", "total_s": 70.0}],
-}  # fmt: skip
-FLEET_SETTING = {
-    "scenario": "mini", "agents": "random", "knows": "own", "share": 0.0, "arrivals_per_hour": 20.0,
-}  # fmt: skip
-CHANGE = dict.fromkeys(CHANGES, -0.5) | {f"{name}_ci95": [-0.75, -0.25] for name in CHANGES}
-FLEET_SUMMARY = {
-    "command": ["parkenv", "fleet"], "version": "0.1.0", "seed": 0, "complete": True, "stay_s": 3600.0, "cautions": {},
-    "rows": [
-        FLEET_SETTING | {
-            "knows": knows, "days": 2, "total_s": 70.0, "total_s_ci95": [60.0, 80.0], "occupancy": 0.5,
-            "balked_fraction": 0.1, "price_of_anarchy": price, "price_of_anarchy_ci95": [price] * 2, "others_s": None,
-        }
-        for knows, price in (("own", 1.1), ("shared", None))
-    ],
-    "hours": [
-        FLEET_SETTING
-        | {"hour": 8, "occupancy": 0.5, "counted_occupancy": 0.75, "excess": -0.25, "excess_ci95": [-0.3, -0.2]}
-    ],
-    "blocks": [
-        FLEET_SETTING | {
-            "block": "Mill Street", "type": "kerb", "zone": "centre", "slots": 10, "price": 2.0, "occupancy": 0.5,
-            "parked_a_day": 20.0, "share_parked": 1.0, "refused_a_day": 1.0, "search_s": 30.0, "walk_s": 20.0,
-            "cruised_m": None, "paid_a_day": 40.0, "paid_a_car": 2.0,
-        }
-    ],
-    "reach": [{"scenario": "mini", "entries": 3, "entries_cut_off": 1}],
-    "changes": [
-        FLEET_SETTING | CHANGE | {
-            "change": "knows", "before": "own observations", "after": "a live map for 50 %", "zone": None,
-            "purpose": None, "prices": None, "days": 2, "cars_a_day": 20.0,
-        }
-    ],
-}  # fmt: skip
 _PIXELS = np.random.default_rng(0).integers(0, 255, (9, 12, 3), dtype=np.uint8)
 
 
@@ -228,10 +177,6 @@ def image(suffix):
 
 
 SLOTS = "".join(f"s{i}{j},{2.5 * i},{j},{0.3 * j - 1.57}\n" for i in range(9) for j in (0, 11))
-CALIBRATION = {
-    "format": "parkenv-calibration", "version": 1, "scenario": "mini", "v_drive": 2.0, "failure_s": 9.0,
-    "manoeuvre_s": 8.0, "trips": 3, "speed_limit": 2.7,
-}  # fmt: skip
 FORMATS = {
     "lot.geojson": Format(json.loads((ROOT / "lots/packaged/mini.geojson").read_text()), mutated_json, lot),
     "map.yml": Format(MAP, mutated_text, lot),
@@ -244,14 +189,14 @@ FORMATS = {
     "model.json": Format(MODEL, mutated_json, sensor_model),
     "scenario.toml": Format(SCENARIO, mutated_text, make_scenario),
     "scenario.json": Format(tomllib.loads(SCENARIO), mutated_json, make_scenario),
-    "experiment.json": Format(EXPERIMENT, mutated_json, Comparison.read),
-    "calibrated.json": Format(CALIBRATION, mutated_json, Calibration.from_file),
+    "experiment.json": Format(GOOD["experiment.json"], mutated_json, Comparison.read),
+    "calibrated.json": Format(GOOD["calibrated.json"], mutated_json, Calibration.from_file),
     "map.sqlite": Format(written(map_file), mutated_bytes, mapped),
     "model.npz": Format((ROOT / "perception/models/side.npz").read_bytes(), mutated_bytes, CarModel.load),
     "trueLocations.txt": Format("0: (-5,30)\n1: (2,3) (4,5)\n", mutated_text, true_locations),
     "result.json": Format(RESULT, mutated_json, check_result),
     "summary.json": Format(SUMMARY, mutated_json, reported),
-    "fleet.json": Format(FLEET_SUMMARY, mutated_json, reported_kind),
+    "fleet.json": Format(GOOD["fleet.json"], mutated_json, reported_kind),
     "results.sqlite": Format(written(stored), mutated_bytes, resumed),
     "settings.json": Format({"seed": 0, "agents": {"mdp": {"failure_s": 1.0}}}, mutated_json, resumed),
 } | {
@@ -299,7 +244,7 @@ FOUND = [
      b'{"type": "Polygon", "coordinates": [[[7, 48], [7, 48], [7, 48], [7, 48]]]}}]}'),
     ("summary.json", b'{"command": ["parkenv", "compare"], "version": "0.1.0", "rows": [7]}'),
     ("summary.json", b'{"command": 5, "version": "0.1.0", "rows": []}'),
-    ("summary.json", json.dumps(SUMMARY | {"seed": 1e300, "rows": [SUMMARY_ROW | {"drive_s": 1e300}]}).encode()),
+    ("summary.json", json.dumps(SUMMARY | {"seed": 1e300, "rows": [SUMMARY["rows"][0] | {"drive_s": 1e300}]}).encode()),
     ("summary.json", json.dumps(SUMMARY).replace("30.0", "1e999").encode()),
     ("settings.json", json.dumps({"seed": "x" * 5000}).encode()),
     ("map.yml", b"PARKING_AREAS: {A: {areas: [{shape: [2, 2015-11-12]}]}}"),
