@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lot_checks import refusal
 from made_maps import FREIBURG, Map
+from test_import_town import VALUES
 
 from parkenv.lots import check_lot, import_lot, read_lot, write_lot
 from parkenv.lots.bays.register import read_bays
@@ -180,25 +181,7 @@ def test_what_does_not_fit_is_listed_by_reason_and_refuses_nothing(tmp_path):
     assert "2 of 9 bays, 22 %, stand on a street" in town.draft.found
 
 
-COLUMNS = {"class": "1/4P", "from_day": "1", "to_day": "0", "start": "07:30:00", "end": "23:59:00"}
-RULES = [
-    ({"limit": "2HR", "rate": "$1.50", "hours": "8A-6P Mon-Sat"}, "1.5/h Mo-Sa 08:00-18:00 120 min"),
-    ({"rate": "2", "hours": "8AM-6PM MON-SAT TANS 4-6PM"},
-     "2/h Mo-Sa 08:00-16:00 open Mo-Sa 00:00-16:00,18:00-24:00; Su 00:00-24:00"),
-    ({"rate": "1", "hours": "PKG 8A-6P Mon-Sat | NP 7P-7A Nightly"},
-     "1/h Mo-Sa 08:00-18:00 open Mo-Su 07:00-19:00"),
-    (COLUMNS, "free 15 min Mo-Su 07:30-24:00"),
-    ({"class": "2P MTR M-SAT 7.30 TO 18.30"}, "paid Mo-Sa 07:30-18:30 120 min"),
-    ({"class": "LZ 30M", "hours": "S-S 7.30 - 6.30PM"},
-     "free open Mo-Fr 00:00-24:00; Sa,Su 00:00-07:30,18:30-24:00"),
-    ({"class": "Disabled Only", "limit": "240"}, "disabled 240 min"),
-    ({"class": "Permit Zone"}, "permit"),
-    ({"limit": "1P", "days": "Mon-Fri", "start": "9:00", "end": "17:00"}, "free 60 min Mo-Fr 09:00-17:00"),
-    ({}, "free"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("rule", "zone"), RULES)
+@pytest.mark.parametrize(("rule", "zone"), VALUES["registers"])
 def test_rules_in_words_and_columns_become_zones(rule, zone):
     tags, unread = tags_of((tuple(rule.items()),) if rule else ())
     assert not unread

@@ -35,7 +35,7 @@ from parkenv.lots.town.supply import (
     kerb_rules,
     rules_of,
 )
-from parkenv.scenarios.spec import ScenarioSpec, lot_scenario
+from parkenv.scenarios.spec import lot_scenario
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.drive_graph import build_drive_graph
 from parkenv.world.lot import Lane
@@ -289,48 +289,6 @@ def test_the_rule_of_kerbs_holds_where_all_are_known():
         assert expected[judged].sum() == pytest.approx(places[judged].sum(), rel=0.1)
         by_street = [np.bincount(street[judged], values[judged]) for values in (expected, places)]
         assert np.corrcoef(by_street)[0, 1] > 0.85
-
-
-DEMAND = {
-    "negative arrivals": ({"arrivals_per_hour": -3}, "arrivals_per_hour.0 is -3"),
-    "no number": ({"arrivals_per_hour": [1.0] * 23 + [float("nan")]}, "arrivals_per_hour.23 is nan"),
-    "too few hours": ({"arrivals_per_hour": [1.0] * 23}, "demand.x.arrivals_per_hour"),
-    "an unknown key": ({"arrivals": 3}, "unknown key 'arrivals'"),
-    "a class that no zone names": ({"classes": {"vip": 0.5}}, "demand.x.classes has 'vip'"),
-    "a class of everybody": ({"classes": {"public": 0.5}}, "demand.x.classes has 'public'"),
-    "more than all of a class": ({"classes": {"permit-a": 1.5}}, "demand.x.classes.permit-a"),
-    "an unknown law": ({"stay_law": "weibull"}, "demand.x.stay_law"),
-    "more parked than spaces": ({"parked": 11}, "demand.x.parked is 11"),
-    "fewer parked than none": ({"parked": -3}, "demand.x.parked"),
-    "goals that the lot has not": ({"goals": [1.0, 2.0]}, "demand.x.goals has 2 numbers, the lot has 1"),
-    "a goal without number": ({"goals": [float("nan")]}, "demand.x.goals.0 is nan"),
-    "an endless stay": ({"stay_s": float("inf")}, "stay_s is inf"),
-}
-COSTS = [
-    *(
-        ({"prices": {"a*": price}}, "costs.prices.a*")
-        for price in ("+x", "+nan", "+inf", "1 @ late", "+-1", "-1/h", True, -1.0)
-    ),
-    ({"prices": {"othr": 1.0}}, "no zone 'othr'; did you mean 'other'"),
-    ({"prices": {"other": -1.0}}, "costs.prices.other is -1.0, want a number from 0"),
-    ({"value_of_time": 0.0}, "costs.value_of_time is 0.0, want a number above 0"),
-]
-
-
-@pytest.mark.parametrize(
-    ("table", "named"),
-    [
-        *(({"demand": {"x": {"arrivals_per_hour": 3.0} | its}}, named) for its, named in DEMAND.values()),
-        *(({"costs": costs}, named) for costs, named in COSTS),
-    ],
-    ids=[*DEMAND, *(f"costs {k}" for k in range(len(COSTS)))],
-)
-def test_a_bad_table_of_a_scenario_is_one_line(table, named):
-    line = refusal(
-        lambda: make_scenario(ScenarioSpec.parse({"lot": "mini"} | table, "bad.toml").of_file("bad.toml"))
-    )
-    assert "bad.toml" in line
-    assert named in line
 
 
 def test_a_bad_demand_of_counts_leaves_nothing(tmp_path):

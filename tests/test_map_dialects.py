@@ -7,32 +7,12 @@ import numpy as np
 import pytest
 from made_maps import FREIBURG, STREET, Map
 from scipy.sparse.csgraph import dijkstra
+from test_import_town import VALUES
 
 from parkenv import InputError
 from parkenv.cli.lot import _square
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.town.draft import import_town
-
-PASSES = [
-    {},
-    {"barrier": "gate", "motor_vehicle": "yes"},
-    {"barrier": "gate", "access": "permissive"},
-    {"barrier": "bollard", "access": "no", "motorcar": "yes"},
-    {"barrier": "cattle_grid"},
-    {"barrier": "toll_booth"},
-    {"barrier": "kerb", "kerb": "lowered"},
-    {"barrier": "swing_gate", "locked": "no"},
-    {"highway": "crossing", "access": "no"},
-]
-STOPS = [
-    *({"barrier": kind} for kind in ("bollard", "block", "lift_gate", "chain", "cycle_barrier", "planter")),
-    {"barrier": "bollard", "bollard": "removable", "bicycle": "yes"},
-    {"barrier": "gate", "access": "private"},
-    {"barrier": "entrance", "vehicle": "no"},
-    {"barrier": "gate", "access": "yes", "locked": "yes"},
-    {"barrier": "kerb", "kerb": "raised"},
-    {"motor_vehicle": "no"},
-]
 
 
 def blocks(tags, at=(100, 0)):
@@ -53,7 +33,7 @@ def metres(lot, one, other):
     return float(dijkstra(lot.drive_matrix(), indices=near[0])[near[1]])
 
 
-@pytest.mark.parametrize(("tags", "passes"), [(t, True) for t in PASSES] + [(t, False) for t in STOPS])
+@pytest.mark.parametrize(("tags", "passes"), VALUES["barriers"])
 def test_cars_pass_no_node_that_stops_them(tmp_path, tags, passes):
     """At a junction between two ways, in each format."""
     place = blocks(tags)
