@@ -1,6 +1,8 @@
 """Tables of single bays: their layouts, their faults, and what fills their gaps."""
 
 import contextlib
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,61 +41,22 @@ def spans(path, **options):
     return [(events.bays[bay], float(a), float(b), int(taken)) for bay, a, b, taken in hours], events.faults
 
 
-LAYOUTS = {
-    "stays": (
-        f"bay,arrival,departure\na,{DAY} 08:00,{DAY} 09:00\na,{DAY} 10:00,{DAY} 12:00\n",
-        [("a", 8, 9, 1), ("a", 9, 10, 0), ("a", 10, 12, 1)],
-    ),
-    "both states": (
-        "StreetMarker;ArrivalTime;DepartureTime;VehiclePresent\n"
-        f"a;{DAY} 08:00;{DAY} 09:00;True\na;{DAY} 09:00;{DAY} 11:00;False\n",
-        [("a", 8, 9, 1), ("a", 9, 11, 0)],
-    ),
-    "since": (
-        f"kerbsideid,status,since,updated\na,Present,{DAY} 08:00,{DAY} 09:00\n",
-        [("a", 7.75, 8, 0), ("a", 8, 9, 1)],
-    ),
-    "snapshots side by side": (
-        "bay_id,state_1,since_utc_1,state_2,since_utc_2\n"
-        f"a,occupied,{DAY} 06:00,vacant,{DAY} 08:00\nb,vacant,{DAY} 07:00,,\n",
-        # The first snapshot was at the latest change that it has, 09:00 in Berlin.
-        [("a", 7.75, 8, 0), ("a", 8, 9, 1), ("a", 9.75, 10, 1), ("b", 8.75, 9, 1)],
-    ),
-    "looks": (f"space,time,state\na,{DAY} 08:00,1\na,{DAY} 09:00,0\n", [("a", 8, 8, 1), ("a", 9, 9, 0)]),
-    "moments": (
-        f"bay_id,{DAY}T08:00,{DAY}T09:00,undated\na,1,0,1\nb,,1,0\n",
-        [("a", 8, 8, 1), ("a", 9, 9, 0), ("b", 9, 9, 1)],
-    ),
-    "changes": (
-        "bay,time,state\n" + "".join(f"a,{DAY} {h:02d}:30,{h % 2}\n" for h in range(24)),
-        [("a", h + 0.5, h + 1.5, h % 2) for h in range(23)],
-    ),
-}
+TABLES = json.loads(Path(__file__).with_name("event_tables.json").read_text(encoding="utf-8"))
+"""Tables in each layout, with what is known of their bays; and rows with each fault."""
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("layout", TABLES["layouts"])
 def test_each_layout_is_read(tmp_path, layout):
-    text, wanted = LAYOUTS[layout]
+    text, wanted = TABLES["layouts"][layout]
     path = table(tmp_path, text)
     assert not is_counts(path)
-    assert spans(path, timezone="Europe/Berlin")[0] == wanted
+    assert spans(path, timezone="Europe/Berlin")[0] == list(map(tuple, wanted))
 
 
-FAULTS = {
-    "negative": f"a,{DAY} 10:00,{DAY} 09:30",
-    "zero": f"a,{DAY} 10:00,{DAY} 10:00",
-    "duplicate": f"a,{DAY} 08:00,{DAY} 09:00",
-    "overlapping": f"a,{DAY} 08:30,{DAY} 08:45",
-    "dead": f"b,{DAY} 08:00,2024-05-10 08:01",
-    "unreadable": "a,yesterday,today",
-    "full_hours": "\n".join(f"b,{DAY} {h:02d}:10,{DAY} {h + 1:02d}:00" for h in range(8)),
-}
-
-
-@pytest.mark.parametrize("rule", FAULTS)
+@pytest.mark.parametrize("rule", TABLES["faults"])
 def test_each_fault_is_cleaned_and_counted(tmp_path, rule):
     stays = f"bay,arrival,departure\na,{DAY} 08:00,{DAY} 09:00\na,{DAY} 09:00,{DAY} 09:20\n"
-    found, faults = spans(table(tmp_path, stays + FAULTS[rule] + "\n"))
+    found, faults = spans(table(tmp_path, stays + TABLES["faults"][rule] + "\n"))
     assert faults == {rule: 8 if rule == "full_hours" else 1}
     assert found[0] == ("a", 8, 8.5 if rule == "overlapping" else 9, 1)
     assert {bay for bay, *_ in found} == {"a"}

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -201,31 +202,8 @@ def test_who_may_park_where_and_when():
         scenario.replace(classes=("permit",))
 
 
-ERRORS = [
-    # what, changes of it, message
-    ("zone", {"price": {"steps": [[60, 2], [120, 1]]}}, "must not fall"),
-    ("zone", {"hours": "20:00-08:00"}, "hours has '20:00-08:00', want an end after"),
-    ("zone", {"price": {"charged": "daily"}}, "charged is 'daily', want hours such as"),
-    ("zone", {"price": {"per_hours": 1}}, "no member 'per_hours' of price; did you mean 'per_hour'"),
-    ("zone", {"price": {"per_hour": float("nan")}}, "per_hour is nan"),
-    ("zone", {"hours": "Xx 08:00-09:00"}, "hours has the day 'Xx'"),
-    ("zone", {"max_stay_s": 0}, "max_stay_s is 0"),
-    ("zone", {"users": "all"}, "zone 'inner': users is 'all'"),
-    ("facility", {"capacity": 2.5}, "capacity is 2.5"),
-    ("facility", {"capacity": -3}, "facility 'P1': capacity is -3"),
-    ("facility", {"gate_s": -1}, "gate_s is -1"),
-    ("facility", {"inside_s": [100]}, "inside_s is "),
-    ("facility", {"type": "silo"}, "facility 'P1': type is 'silo', want one of kerb"),
-    (
-        "facility",
-        {"zone": "iner"},
-        "facility 'P1': zone is 'iner', want one of the file's zones; did you mean 'inner'",
-    ),
-    ("facility", {"capacty": 1}, "no property 'capacty' of facilities; did you mean 'capacity'"),
-    ("facility", {"at": [500.0, 20.0]}, "m from the nearest lane, want at most 150 m"),
-    ("slot", {"facility": "curb"}, "facility is 'curb', want that of a feature"),
-    ("slot", {"id": "P1"}, "id 'P1' appears already"),
-]
+ERRORS = json.loads(Path(__file__).with_name("bad_towns.json").read_text(encoding="utf-8"))
+"""Kinds of features, changes of them, and what is said of each."""
 
 
 @pytest.mark.parametrize(("kind", "changes", "message"), ERRORS)
