@@ -216,75 +216,27 @@ def test_dragon_lake_is_a_lot():
     assert check_lot(DRAGON_LAKE) == []
 
 
-def set_feature(index, *arguments, **properties):
-    def change(doc):
-        doc["features"][index] = feature(*arguments, **properties)
-
-    return change
-
-
-def exact(**changes):
-    return lambda doc: with_exact(doc["features"][0], **changes)
-
-
-def set_properties(index, **changes):
-    return lambda doc: doc["features"][index]["properties"].update(changes)
-
-
 def lanes(*lines):
     return lambda doc: doc["features"].extend(feature("lane", "LineString", line) for line in lines)
 
 
-FAULTS = [
-    # change, feature, message
-    (lambda d: d.update(type="Feature"), None, "type is 'Feature', want a GeoJSON 'FeatureCollection'"),
-    (lambda d: d["parkenv"].update(version=2), None, "parkenv.version is 2, want 1: made by a newer parkenv"),
-    (lambda d: d.update(frame="utm"), None, "frame is 'utm', want 'local'"),
-    (lambda d: d.update(name=3), None, "name is 3, want a text"),
-    (lambda d: d["features"].__setitem__(5, "wall"), 5, "want a GeoJSON object of type 'Feature'"),
-    (set_feature(0, "tree", "Point", [0, 0]), 0, "kind is 'tree', want one of slot, lane, entry, goal, wall"),
-    (set_feature(2, "lane", "Polygon", box(0, 0, 1, 1)), 2, "lane: geometry is 'Polygon', want LineString"),
-    (set_feature(5, "wall", "Point", [0, 0]), 5, "wall: geometry is 'Point', want LineString or Polygon"),
-    (lambda d: d["features"][3].update(geometry=None), 3, "entry: geometry is None, want Point"),
-    (set_properties(1, parking_cost_s=-1), 1, "slot 'b': parking_cost_s is -1, want a finite number"),
-    (set_properties(1, parking_cost_s=None), 1, "slot 'b': parking_cost_s is None, want a finite number"),
-    (set_feature(3, "entry", "Point", [0, float("nan")]), 3, "entry: position [0, nan], want two finite"),
-    (set_feature(2, "lane", "LineString", [[0, 0]]), 2, "want at least 2 positions"),
-    (set_feature(2, "lane", "LineString", [[0, 0], [0, 0]]), 2, "are equal, want different points"),
-    (set_feature(2, "lane", "LineString", [[0, 0], [40, 0]], oneway="no"), 2, "oneway is 'no', want true"),
-    (set_feature(0, "slot", "Polygon", []), 0, "slot: coordinates are [], want a list of rings"),
-    (set_feature(0, "slot", "Polygon", 2 * box(10, 3, 12, 8)), 0, "slot: the polygon has 2 rings, want 1"),
-    (set_feature(0, "slot", "Polygon", [box(10, 3, 12, 8)[0][:4]]), 0, "slot: the polygon's ring is open"),
-    (
-        set_feature(0, "slot", "Polygon", [[[10, 3], [12, 8], [12, 3], [10, 8], [10, 3]]], id="a"),
-        0,
-        "slot 'a': the polygon is not a simple one: Self-intersection",
-    ),
-    (set_feature(0, "slot", "Polygon", [[[9, 3], [9, 8], [9, 5], [9, 3]]], id="a"), 0, "polygon is flat"),
-    (set_feature(0, "slot", "Polygon", box(10, 3, 10.01, 8), id="a"), 0, "'a': the polygon is 0.010 m wide"),
-    (set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id="b"), 1, "slot: id 'b' appears already"),
-    (set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id=[1]), 0, "slot: id is [1], want a text"),
-    (exact(center=[11.3, 5.5]), 0, "slot 'a': the polygon lies 0.05 m from what center, yaw, length"),
-    (exact(width=float("nan")), 0, "slot 'a': width is nan, want"),
-    (exact(yaw="north"), 0, "slot 'a': yaw is 'north', want a number"),
-    (exact(mouth="front"), 0, "slot 'a': mouth is 'front', want 'rear', 'left' or 'right'"),
-    (set_properties(0, yaw=0.0), 0, "slot 'a': center is missing"),
-    (set_feature(1, "slot", "Polygon", box(20, 30, 22.5, 35), id="b"), 1, "slot 'b' is on no lane:"),
-    (set_feature(3, "entry", "Point", [0, 20]), 3, "entry is 20.0 m from the nearest lane, want at most 15"),
-    (
-        lanes(*([[40, 0], [40 + dx, dy]] for dx, dy in ((9, 9), (9, 0), (9, -9), (0, -9)))),
-        2,
-        "lane: the junction at (40.0, 0.0) m has 5 lanes that lead away",
-    ),
-    (lambda d: d.update(features=d["features"][2:]), None, "no slot: an empty lot"),
-]
+BAD = json.loads(Path(__file__).with_name("bad_lots.json").read_text(encoding="utf-8"))
+"""Changes of the sound lot, the number of the feature that is at fault, if it is one, and what is said of it."""
 
 
-@pytest.mark.parametrize(("change", "number", "message"), FAULTS, ids=map(str, range(len(FAULTS))))
-def test_faults_are_named(tmp_path, change, number, message):
+def changed(changes):
     doc = document()
-    change(doc)
-    path = written(tmp_path, doc)
+    features = changes.get("features", {})
+    if isinstance(features, list):
+        return doc | changes
+    for number, its in features.items():
+        doc["features"][int(number) : int(number) + 1] = [its]
+    return doc | {name: value for name, value in changes.items() if name != "features"}
+
+
+@pytest.mark.parametrize(("changes", "number", "message"), BAD["faults"])
+def test_faults_are_named(tmp_path, changes, number, message):
+    path = written(tmp_path, changed(changes))
     errors = [problem for problem in check_lot(path) if problem.severity == "error"]
     assert [problem.feature for problem in errors] == [number]
     assert message in errors[0].message
@@ -374,21 +326,9 @@ def test_all_faults_are_listed_at_once(tmp_path):
         read_lot(path)
 
 
-WARNINGS = [
-    (set_feature(4, "goal", "Point", [200, 0]), 4, "goal: the nearest lane is 160 m away"),
-    (set_feature(1, "slot", "Polygon", box(11, 3, 13.5, 8), id="b"), 1, "slot 'b' overlaps slot 'a'"),
-    (lanes([[30, -9], [30, 9]]), 6, "lane crosses the lane of feature 2 at (30.0, 0.0) m without"),
-    (lanes([[30, 0], [30, 9]]), 6, "lane crosses the lane of feature 2 at (30.0, 0.0) m without"),
-    (lanes([[40.4, 0], [60, 0]]), 6, "lane ends 0.40 m from the lane of feature 2 without"),
-    (exact(yaw=-np.pi / 2), 0, "slot 'a': its mouth faces away from its lane"),
-]
-
-
-@pytest.mark.parametrize(("change", "number", "message"), WARNINGS, ids=map(str, range(len(WARNINGS))))
-def test_slips_of_the_pen_are_warned_of_and_read(tmp_path, change, number, message):
-    doc = document()
-    change(doc)
-    path = written(tmp_path, doc)
+@pytest.mark.parametrize(("changes", "number", "message"), BAD["warnings"])
+def test_slips_of_the_pen_are_warned_of_and_read(tmp_path, changes, number, message):
+    path = written(tmp_path, changed(changes))
     problems = check_lot(path)
     assert {p.severity for p in problems} == {"warning"}
     assert any(p.feature == number and message in p.message for p in problems), problems
