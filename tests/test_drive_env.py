@@ -292,29 +292,15 @@ def test_running_into_one_who_moves_is_a_contact(number, word):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("slot", "message"),
     [
-        ({"lot": "nowhere"}, "nowhere: no such file, nor a packaged lot"),
-        ({"lot": 3}, "lot is a int"),
-        ({"kinds": ("diagonal",)}, "kinds is .*diagonal"),
-        ({"kinds": ("parallel",)}, "'campus' has no slot of the kinds parallel"),
-        ({"ways": ()}, "ways is ()"),
-        ({"slot": "Z9"}, "has no slot 'Z9'"),
-        ({"occupancy": 1.5}, "occupancy is 1.5, want a number of at most 1"),
-        ({"slack": float("nan")}, "slack is nan"),
-        ({"distance": (5.0, 90.0)}, "distance is "),
-        ({"starts": "sky"}, "starts is 'sky'"),
-        ({"reward": "kind"}, "reward is 'kind', want one of sparse, dense"),
-        ({"contact_cost": -1.0}, "contact_cost is -1.0"),
-        ({"laser": 3}, "laser is 3"),
-        ({"traffic": 3}, "traffic is a int, want a Traffic"),
-        ({"vehicle": VehicleParameters(width=2.6), "slot": "A1"}, "slot 'A1' of lot 'campus' is 2.5 m wide"),
-        ({"vehicle": VehicleParameters(width=2.6)}, "no slot of the kinds .* at least 4.26 m × 2.6 m"),
+        ("A1", "slot 'A1' of lot 'campus' is 2.5 m wide"),
+        (None, "no slot of the kinds .* at least 4.26 m × 2.6 m"),
     ],
 )
-def test_wrong_arguments_are_one_clear_error(arguments, message):
+def test_a_car_that_fits_no_slot_is_refused(slot, message):
     with pytest.raises(InputError, match=message):
-        make(**arguments).reset(seed=0)
+        make(vehicle=VehicleParameters(width=2.6), slot=slot).reset(seed=0)
 
 
 def test_actions_and_starts_that_are_none_are_refused():

@@ -140,24 +140,6 @@ def test_every_agent_drives_a_car_whose_rewards_are_sums_of_terms_and_whose_retu
     assert returns == pytest.approx({agent: -total for agent, total in totals.items()})
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"cars": 0}, "cars is 0"),
-        ({"max_cycles": 0}, "max_cycles is 0"),
-        ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
-        ({"scenario": "moon"}, "moon"),
-        ({"knows": "all"}, r"knows is 'all'"),
-        ({"manoeuvre_s": -1}, "manoeuvre_s is -1"),
-    ],
-)
-def test_bad_options_are_refused_in_a_line(options, words):
-    for make in (lot_v0.raw_env, lot_v0.parallel_env):
-        with pytest.raises(InputError, match=words) as caught:
-            make(**options)
-        assert "\n" not in str(caught.value)
-
-
 def test_a_bad_tick_and_missing_actions_are_refused():
     with pytest.raises(InputError, match="tick_s is 0"):
         lot_v0.parallel_env(tick_s=0)

@@ -1,5 +1,9 @@
 """Options of `gymnasium.make`, and what environments answer to wrong arguments and calls out of order."""
 
+import json
+import re
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,6 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import flatdim
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from lot_checks import refusal
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -15,6 +20,8 @@ from parkenv import InputError, lot_v0, make_agent, make_scenario, simulate
 from parkenv.envs import flat_ids
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.sb3 import SearchVecEnv
+from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.mapping.survey import SurveySettings
 from parkenv.world.cost_terms import REWARD_TERMS
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
@@ -217,6 +224,38 @@ def test_an_unknown_keyword_is_a_type_error_as_of_any_python_function(make, name
 def test_a_wrong_argument_of_a_search_is_named(make, options, error, message):
     with pytest.raises(error, match=message):
         make("parkenv/Search-v2", scenario="mini", **options)
+
+
+def started(**options):
+    """A single environment and a batch refuse the same."""
+    single, batch = make(), ParkSearchVectorEnv(2, ["mini", "street"])
+    lines = [refusal(env.reset, seed=0, options=options) for env in (single, batch)]
+    assert lines[0] == lines[1]
+    raise InputError(lines[0])
+
+
+def cars(**options):
+    lines = [refusal(make, **options) for make in (lot_v0.raw_env, lot_v0.parallel_env)]
+    assert lines[0] == lines[1]
+    raise InputError(lines[0])
+
+
+TAKERS = {
+    "Drive": lambda **options: gym.make("parkenv/Drive-v1", **{"lot": "campus"} | options).reset(seed=0),
+    "SearchSensors": lambda **options: gym.make("parkenv/SearchSensors-v2", **{"scenario": "mini"} | options),
+    "batch": lambda **options: ParkSearchVectorEnv(**{"scenario": "mini"} | options),
+    "start": started,
+    "cars": cars,
+    "survey": SurveySettings,
+    "agent": lambda name, **options: make_agent(name, make_scenario("mini"), **options),
+}
+BAD = json.loads(Path(__file__).with_name("bad_arguments.json").read_text(encoding="utf-8"))
+"""Who takes arguments, wrong ones, and what is said of them."""
+
+
+@pytest.mark.parametrize(("taker", "arguments", "said"), BAD)
+def test_a_wrong_argument_is_one_line_with_what_was_wanted(taker, arguments, said):
+    assert re.search(said, refusal(TAKERS[taker], **arguments))
 
 
 def test_other_makers_say_it_alike_and_name_what_is_near():

@@ -455,19 +455,6 @@ def test_both_solvers_lead_to_the_same_actions(name, failure_s):
     assert replans > 0, "on an empty day a search ends without any"
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"solver": "lp"}, "solver is 'lp'"),
-        ({"gamma": 1.0, "solver": "policy_iteration"}, "gamma is 1.0"),
-        ({"gamma": 0.0}, "gamma is 0.0"),
-    ],
-)
-def test_bad_options_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        make_agent("mdp", make_scenario("mini"), **options)
-
-
 def test_a_hopeless_slot_found_taken_is_news_and_a_drift_is_not():
     scenario = make_scenario("mini")
     agent = make_agent("mdp", scenario)

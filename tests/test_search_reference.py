@@ -12,7 +12,6 @@ from search_reference import ReferenceSearch
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.envs.local_observation import LocalObservation
-from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import city_lot, grid_lot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
@@ -323,22 +322,6 @@ def test_a_lot_of_thousands_of_slots_touches_only_what_is_near():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"num_envs": 0}, "num_envs is 0, want a whole number from 1 to 1,000,000"),
-        ({"max_episode_steps": 0}, "max_episode_steps is 0"),
-        ({"observation": "raw"}, "observation is 'raw', want one of full, occupancy, local"),
-        ({"observation": "local", "k": 0}, "k is 0"),
-        ({"autoreset_mode": "Sometimes"}, "autoreset_mode is 'Sometimes', want one of NextStep"),
-        ({"render_mode": "human"}, "render_mode is 'human'"),
-    ],
-)
-def test_wrong_arguments_are_refused_by_name(wrong, message):
-    with pytest.raises(InputError, match=message):
-        ParkSearchVectorEnv(**({"scenario": "mini"} | wrong))
-
-
-@pytest.mark.parametrize(
     ("options", "second"),
     [
         ({"scenario": "street", "entry": 1, "arrival": "Tue 08:30"}, 86400.0 + 8.5 * 3600.0),
@@ -377,27 +360,6 @@ def made():
     """A batch, and a single environment."""
     places = ["mini", "street"]
     return make_batch(2, places), gym.make("parkenv/Search-v2", scenario=places)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"scenario": "moon"}, "option scenario is 'moon', want one of mini, street"),
-        ({"scenario": 2}, "option scenario is 2, want a whole number from 0 to 1"),
-        ({"entry": 0}, "option scenario is None, want one of mini, street"),
-        ({"scenario": 0, "entry": 9}, "option entry is 9, want a whole number from 0 to 0"),
-        ({"scenario": 0, "arrival": "sun 10:00"}, "day of option arrival is 'sun', want one of mon, tue"),
-        ({"scenario": 0, "arrival": -1}, "option arrival is -1, want a finite number at least 0"),
-        *(
-            ({"scenario": 0, "arrival": text}, f"option arrival is '{text}', want seconds since Monday 00:00")
-            for text in ("Tue at 8", "8:30", "Tue", "Tuesday 8:30", "Tue 25:00", "weekdays 08:30")
-        ),
-    ],
-)
-def test_a_start_that_is_none_is_refused(made, options, message):
-    for env in made:
-        with pytest.raises(InputError, match=message):
-            env.reset(seed=0, options=options)
 
 
 def test_a_batch_draws_the_frames_of_its_single_environments():

@@ -133,23 +133,6 @@ def test_pictures_of_another_width():
             make(picture_width=wrong)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"rig": "lidar"}, "rig is 'lidar', want a SensorRig or one of laser, stereo, both_sides"),
-        ({"weather": "snow"}, "weather is 'snow'"),
-        ({"captures": 0}, "captures is 0, want a whole number of at least 1"),
-        ({"every": float("nan")}, "every is nan, want a finite number above 0"),
-        ({"observation": "scans"}, "observation is 'scans', want one of full, scan"),
-        ({"observation": "scan", "rig": "stereo"}, 'observation is "scan", want a rig with a laser'),
-        ({"arrival": "08:00"}, "arrival is '08:00', want an instance of ArrivalWindow"),
-    ],
-)
-def test_bad_arguments_are_named(options, words):
-    with pytest.raises(InputError, match=words):
-        make(**options)
-
-
 def coming_and_going(lot):
     """Cars that stay five minutes."""
     return OccupancyProcess.from_demand(np.zeros(lot.n_slots), np.zeros(168), 300.0)

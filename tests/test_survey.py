@@ -139,21 +139,6 @@ def test_a_rig_that_cannot_see_is_refused():
         PerceptionPipeline(laser, make_scenario("mini").lot)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"rig": "radar"}, "rig is 'radar'"),
-        ({"weather": "hail"}, "weather is 'hail'"),
-        ({"windows": ()}, "windows is empty"),
-        ({"every": 0.0}, "every is 0"),
-        ({"picture_width": 12}, "picture_width is 12"),
-    ],
-)
-def test_bad_settings_are_named(wrong, message):
-    with pytest.raises(InputError, match=message):
-        SurveySettings(**wrong)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rig", "every", "accuracy"), [("campus", "laser", 9.0, 0.97), ("street", "stereo", 6.0, 0.94)]
