@@ -311,35 +311,13 @@ class Raises:
         raise RuntimeError("out of fuel")
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: Headways(0), "cars is 0, want a number of at least 1"),
-        (lambda: Headways(3, -1.0), "mean_s is -1.0"),
-        (lambda: PoissonArrivals((1.0,) * 23), "per_hour is"),
-        (lambda: PoissonArrivals(5.0, 3600.0, 3600.0), "end_s is 3600.0"),
-        (lambda: PoissonArrivals(1e9), "1,000,000"),
-        (lambda: ListedArrivals((5.0, 4.0)), "ascending"),
-        (lambda: ExponentialTime(0.0), "mean_s is 0.0"),
-        (lambda: ConstantTime(math.nan), "seconds is nan"),
-        (lambda: Demand(stay=60.0), "stay is 60.0"),
-        (lambda: Demand(goal_weights=(0.0,)), "goal_weights is"),
-        (lambda: Fleet("mini", Demand(goal_weights=(1.0,) * 9)), "Demand.goal_weights has 9 numbers"),
-        (lambda: Fleet("mini", background="crowd"), "background is 'crowd'"),
-        (lambda: Fleet("mini", tick_s=-1.0), "tick_s is -1.0"),
-        (lambda: Fleet("mini", max_steps=0), "max_steps is 0"),
-        (lambda: Fleet("mini", drivers=[]), "drivers is"),
-        (lambda: Fleet("mini", drivers=[DriverKind(0.0)]), "all weights are 0"),
-        (lambda: DriverKind(weight=-0.1), "weight is -0.1"),
-        (lambda: Fleet("mini", delay_s=math.inf), "delay_s is inf"),
-        (lambda: DriverKind(knows="everything"), "knows is 'everything'"),
-        (lambda: DriverKind(policy="random"), "policy is"),
-    ],
-)
-def test_bad_input_is_refused_in_a_line(make, words):
-    with pytest.raises(InputError, match=words) as caught:
-        make()
-    assert "\n" not in str(caught.value)
+def test_weights_that_do_not_fit_are_refused():
+    for options, words in (
+        ({"demand": Demand(goal_weights=(1.0,) * 9)}, "Demand.goal_weights has 9 numbers"),
+        ({"drivers": [DriverKind(0.0)]}, "all weights are 0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Fleet("mini", **options)
 
 
 def test_an_agent_that_raises_stops_the_run_and_names_the_car():

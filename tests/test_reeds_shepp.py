@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.vehicle import (
     ACCELERATION,
@@ -206,21 +205,6 @@ def test_an_arc_in_pieces_is_the_same_arc(curvature, way, pieces):
     for _ in range(pieces):
         there = move_along(*there, curvature, way / pieces)
     np.testing.assert_allclose(there, move_along(1.0, 2.0, 0.5, curvature, way), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"length": 0.0}, "vehicle: length is 0.0, want a number above 0"),
-        ({"width": float("nan")}, "vehicle: width is nan"),
-        ({"wheelbase": 4.0}, "want both within the length"),
-        ({"max_steering": 1.6}, "below a right angle"),
-        ({"max_speed": 50.0}, "half a length in a step"),
-    ],
-)
-def test_a_car_that_cannot_be_is_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        replace(CAR, **change)
 
 
 @given(

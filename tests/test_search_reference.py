@@ -355,13 +355,6 @@ def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environme
     np.testing.assert_array_equal(later["time"], plain.reset()[0]["time"], "the choice is for one episode")
 
 
-@pytest.fixture(scope="module")
-def made():
-    """A batch, and a single environment."""
-    places = ["mini", "street"]
-    return make_batch(2, places), gym.make("parkenv/Search-v2", scenario=places)
-
-
 def test_a_batch_draws_the_frames_of_its_single_environments():
     options = {"scenario": "mini", "render_mode": "rgb_array"}
     envs = gym.make_vec("parkenv/Search-v2", 2, vectorization_mode="vector_entry_point", **options)

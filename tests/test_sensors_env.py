@@ -272,22 +272,6 @@ def test_moving_shadows_are_those_of_a_scene_made_anew():
     assert (darker & ground).sum() > 300
 
 
-@pytest.mark.parametrize(
-    ("movers", "words"),
-    [
-        ({"vehicle_pose": [[0.0, np.nan, 0.0]], "vehicle_model": [0]}, r"vehicle_pose\[0, 1\]"),
-        ({"vehicle_pose": [[0.0, 0.0, 0.0]]}, "vehicle_model .*want"),
-        (
-            {"walker_pose": [[0.0] * 3], "walker_look": [99], "walker_stride": [0.0]},
-            "walker_look .*want 0 to 11",
-        ),
-    ],
-)
-def test_bad_movers_are_named(movers, words):
-    with pytest.raises(SensorError, match=words):
-        Movers(**movers)
-
-
 def test_samplers_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
     scenario = make_scenario("mini", traffic=BUSY)
     env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
