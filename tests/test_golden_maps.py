@@ -250,6 +250,9 @@ TOWNS = {
 }
 
 
+MAPS |= {"turns: restricted": restricted(**LEFT), "turns: away": car_park().turn(1, (0, -20), 2, **LEFT)}
+
+
 def described(name, folder):
     """What a map becomes, in values that a reader can compare, rounded to a centimetre."""
     draft = MAPS[name].draft(folder)
