@@ -465,7 +465,7 @@ def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
 
 def test_park_writes_its_table_and_pictures(tmp_path):
     out = tmp_path / "park"
-    ran("park --lot mini --episodes 3 --out", out)
+    ran("park --lot mini --episodes 3 --jobs 1 --out", out)
     *kinds, overall = summary_of(out)["rows"]
     assert (overall["kind"], overall["episodes"]) == ("all", 3)
     assert sum(row["parked"] for row in kinds) == overall["parked"]

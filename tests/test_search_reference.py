@@ -1,6 +1,7 @@
 """The compiled search, alone and as a batch, against a plain reference; mixed lots, resets, ends, bad input."""
 
 import dataclasses
+from functools import cache
 
 import gymnasium as gym
 import numpy as np
@@ -140,6 +141,7 @@ class Rumour(PriorModel):
         return Forecast(p, np.full(self.n_slots, 1 / 900), DayError(p[-1], 0.5 * p[-1]))
 
 
+@cache
 def recorded_scenario():
     lot = grid_lot(2, 8)
     occupancy = RecordedOccupancy(random_log(np.random.default_rng(0)), lot.walk_m(0))
