@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.compiled.arrays import FloatArray
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_forecast import MIN_HOURS, DayForecast, day_means, held, quantiles_of_t
 
@@ -189,6 +189,6 @@ def ratio_of_sums(
     return Estimate(float(total.sum() / n.sum()), float(low), float(high))
 
 
-def mean_where(values: FloatArray, mask: BoolArray | None = None) -> float:
-    chosen = values[np.isfinite(values) if mask is None else np.isfinite(values) & mask]
+def mean_where(values: FloatArray) -> float:
+    chosen = values[np.isfinite(values)]
     return float(chosen.mean()) if chosen.size else float("nan")

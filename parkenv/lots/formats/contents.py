@@ -66,11 +66,6 @@ class RawFeature:
     given_id: object
 
 
-def is_coordinate(value: Any) -> bool:
-    # Comparisons with NaN are false; a bool is an int in Python but not a number in JSON.
-    return type(value) in (float, int) and abs(value) <= FARTHEST
-
-
 @dataclass
 class LotContents:
     """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` those of the other features."""

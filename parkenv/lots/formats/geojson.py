@@ -47,7 +47,6 @@ from parkenv.lots.formats.contents import (
     LotContents,
     RawFeature,
     facility_properties,
-    is_coordinate,
     read_facilities,
     read_slots,
     read_weights,
@@ -309,8 +308,10 @@ def _check_feature(
 
 
 def _position(kind: str, position: Any) -> tuple[float, float]:
-    if isinstance(position, list) and len(position) >= 2 and all(map(is_coordinate, position)):
-        return float(position[0]), float(position[1])
+    # Comparisons with NaN are false; a bool is an int in Python but not a number in JSON.
+    numbers: Any = position if isinstance(position, list) and len(position) >= 2 else [None]
+    if all(type(value) in (float, int) and abs(value) <= FARTHEST for value in numbers):
+        return float(numbers[0]), float(numbers[1])
     raise InputError(f"{kind}: position {position!r:.60}, want two finite numbers, at most {FARTHEST:.0e}")
 
 

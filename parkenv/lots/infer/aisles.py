@@ -264,10 +264,6 @@ class Aisle:
         0  # 1 or -1: cars drive in or against the order of the points, by the slant of spaces; 0: both
     )
 
-    @property
-    def line(self) -> shapely.LineString:
-        return shapely.LineString(self.points)
-
 
 def find_aisles(
     spaces: Spaces,
@@ -477,7 +473,7 @@ def _clear_parts(points: FloatArray, tree: shapely.STRtree) -> list[FloatArray]:
 
 
 def _extended(aisles: Sequence[Aisle], tree: shapely.STRtree) -> list[Aisle]:
-    lines = np.array([aisle.line for aisle in aisles])
+    lines = np.array([shapely.LineString(aisle.points) for aisle in aisles])
     crossing = shapely.STRtree(lines)
     extended = []
     for a, aisle in enumerate(aisles):

@@ -56,16 +56,6 @@ class Spaces:
         corners = corner_points(self.xy, yaw, self.length - shrink, self.width - shrink)
         return np.atleast_1d(np.asarray(shapely.polygons(corners)))
 
-    def subset(self, index: IntArray) -> Self:
-        return type(self)(
-            tuple(self.ids[i] for i in index.tolist()),
-            self.xy[index],
-            self.axis[index],
-            self.length[index],
-            self.width[index],
-            None if self.opens is None else self.opens[index],
-        )
-
 
 def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> Spaces:
     """Return the spaces of outlines, (n,) valid polygons, m: rectangles of their area, narrowed until none overlap."""
@@ -354,7 +344,8 @@ def spaces_from_centers(
             opens[index] = 0.0 if nose is None else -nose
             length[index], width[index] = BAY_SIZE[0], row.extent(WIDEST_BAY) * np.sin(angle)
     kept = np.setdiff1d(np.arange(n), strays)
-    return without_overlaps(Spaces(tuple(ids), xy, axis, length, width, opens).subset(kept)), kept
+    columns = (values[kept] for values in (xy, axis, length, width, opens))
+    return without_overlaps(Spaces(tuple(ids[i] for i in kept.tolist()), *columns)), kept
 
 
 def _find_rows(xy: FloatArray) -> tuple[list[CenterRow], IntArray]:

@@ -172,17 +172,17 @@ def hours_text(minutes: BoolArray) -> str:
     return str(Hours(tuple(days)))
 
 
-def conditional(tags: Tags, key: str, base: str = "") -> tuple[Conditional, list[tuple[str, float]]]:
+def conditional(tags: Tags, key: str) -> tuple[Conditional, list[tuple[str, float]]]:
     """Return the values of a key and of its `:conditional`, and those for stays shorter than some s.
 
     Conditions that an ordinary car or driver never meets are left away, and those that cannot be read are listed.
     """
     clauses: list[tuple[str, BoolArray]] = []
     short: list[tuple[str, float]] = []
-    value = tags.get(key, base).strip()
+    value = tags.get(key, "").strip()
     texts = [(f"{key}:conditional", tags.get(f"{key}:conditional", ""))]
     if "@" in value:
-        texts, value = [(key, value), *texts], base
+        texts, value = [(key, value), *texts], ""
     for name, text in texts:
         for part in _clauses(text):
             to, _, condition = part.partition("@")
