@@ -4,9 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import shapely
+from gymnasium.utils.env_checker import check_env
 
 import parkenv
 from parkenv import OccupancyProcess
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.perception.departure_cues import WEIGHTS, DepartureCues, log_likelihood_ratio
+from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.world.cue_scene import ARRIVED_S, CueScene
 from parkenv.world.cues import Cues
 from parkenv.world.lot_scene import LotScenes, slot_lot
@@ -16,7 +20,7 @@ from sim_sensors.camera.weather import Weather
 from sim_sensors.ground_truth import vehicle_boxes
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.mesh import Lamps
-from sim_sensors.rig import RIGHT, Mount, SensorRig
+from sim_sensors.rig import RIGHT, Mount, SensorRig, TimedCapture
 
 RIG = SensorRig(
     cameras=(("right", PinholeCamera.from_field_of_view(160, 120), Mount(z=1.1, yaw=RIGHT)),),
@@ -157,3 +161,73 @@ def test_raw_sensors_have_cues_and_no_belief_about_them():
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     assert "cues" not in observation
+
+
+class Steady:
+    """Likelihoods that do not depend on what is seen."""
+
+    def __init__(self, ratio):
+        self.ratio = ratio
+
+    def __call__(self, features):
+        return np.full(len(features), np.log(self.ratio))
+
+
+def test_the_belief_after_perceived_cues_is_by_bayes_rule_and_successive_pictures_count_once(monkeypatch):
+    monkeypatch.setattr("parkenv.envs.perception.log_likelihood_ratio", Steady(10.0))
+    env = gym.make("parkenv/SearchPerception-v2", scenario=busy(), rig=RIG, weather="rain")
+    observation, _ = env.reset(seed=4)
+    n, before = env.unwrapped.scenario.lot.n_slots, np.zeros(0)
+    for _ in range(2):
+        move = int(np.flatnonzero(observation["action_mask"][:4])[0])
+        observation, *_ = env.step(move)
+        (slots, taken), excess = env.unwrapped.perception.observation, observation["cues"][:n]
+        fresh = np.setdiff1d(slots[taken], np.flatnonzero(before))
+        forecast, decay_rate, p = observation["belief"].reshape(4, -1)[:3]
+        usual = decay_rate * (1.0 - forecast) / observation["cues"][n:] * p
+        after = 10.0 * usual / (10.0 * usual + 1.0 - usual)
+        assert len(fresh) or len(before)
+        np.testing.assert_allclose(excess[fresh], (after - usual)[fresh], rtol=1e-4)
+        again = np.intersect1d(slots[taken], np.flatnonzero(before))
+        assert (excess[again] <= before[again] + 1e-6).all()
+        before = excess.copy()
+
+
+def test_lamps_and_motion_are_evidence_that_a_car_leaves():
+    leaving = Departure()
+    rig, scenes = SensorRig.thesis().resized(400), leaving.scenes()
+    pipeline, cues = PerceptionPipeline(rig, leaving.scenario.lot), DepartureCues(leaving.scenario.lot)
+    results = {}
+    for left, turn in ((leaving.lead + 40.0, 0.0), (9.0, 0.0), (2.0, 0.4), (0.2, 0.4)):
+        time, pose = leaving.end - left, leaving.pose + np.array([0.0, 0.0, turn])
+        capture = rig.capture(scenes.at(time, pose), pose, Weather.draw("overcast", 3), 0)
+        results[left] = pipeline.locate(TimedCapture(time, capture))
+    still, lit, moves, out = results.values()
+    rows = [
+        cues.features(pair, np.array([leaving.slot])) for pair in ((still, still), (still, lit), (moves, out))
+    ]
+    shown = [dict(zip(WEIGHTS, row[0], strict=True)) for row in rows]
+    assert shown[0]["picture"] == shown[1]["picture"] == 1.0
+    assert shown[0]["red"] == 0.0 < 0.3 < shown[1]["red"]
+    assert shown[1]["moved"] == 0.0 < 0.5 < shown[2]["moved"]
+    ratio = [log_likelihood_ratio(row)[0] for row in rows]
+    assert ratio[0] < 0.0 < 0.8 < ratio[1]
+    assert ratio[2] > 1.5
+
+
+def test_the_belief_in_a_slot_falls_as_its_car_is_seen_to_leave():
+    """And without cues it does not: the same drive in the same world."""
+    options = {"weather": "overcast", "rig": "laser", "picture_width": 400}
+    envs = [
+        gym.make("parkenv/SearchPerception-v2", scenario=scenario, **options).unwrapped
+        for scenario in (busy(stay_s=200.0), busy(stay_s=200.0).replace(cues=None))
+    ]
+    check_env(envs[0], skip_render_check=True)
+    seen = [env.reset(seed=36)[0] for env in envs]
+    for _ in range(3):
+        seen = [env.step(3)[0] for env in envs]
+    later = [SlotBelief.of_observation(observation).decay(20.0).p_occupied for observation in seen]
+    slot = int(np.argmin(later[0] - later[1]))
+    assert later[0][slot] < later[1][slot] - 0.1
+    left = envs[0].state.world.next_free([slot], envs[0].state.time)[0] - envs[0].state.time
+    assert 0.0 < left < 40.0

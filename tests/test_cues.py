@@ -13,7 +13,7 @@ from parkenv import InputError, OccupancyProcess, lot_v0
 from parkenv.belief.cue_belief import freed
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.envs.local_observation import LocalObservation
-from parkenv.world.cues import MOVING_S, Cues
+from parkenv.world.cues import MOVING_S, SENSED, Cues
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.recorded import RecordedOccupancy
@@ -269,8 +269,6 @@ def test_worlds_of_the_model_leave_as_its_belief_says():
 def test_what_does_not_know_cues_says_so(tmp_path):
     with pytest.raises(InputError, match=r"hit_rate is 0.1, want at least false_alarm_rate, 0.2"):
         Cues(hit_rate=0.1, false_alarm_rate=0.2)
-    with pytest.raises(InputError, match=r"cues of departures are not perceived"):
-        gym.make("parkenv/SearchPerception-v2", scenario=busy(Cues()))
     for given in ("often", "0.5", "0.5,0.1,31,9"):
         done = command("compare", "--cues", given, "--out", tmp_path / "run")
         assert done.returncode == 2
@@ -281,3 +279,4 @@ def test_the_command_line_and_files_have_cues():
     for given in ("perfect", "1,0,31", {"lead_s": 31.0}):
         assert parkenv.make_scenario({"base": "mini", "cues": given}).cues == Cues()
     assert parkenv.make_scenario({"base": "mini", "cues": "0.5,0.01"}).cues == Cues(31.0, 0.5, 0.01)
+    assert parkenv.make_scenario({"base": "mini", "cues": "sensed"}).cues == Cues(31.0, *SENSED)

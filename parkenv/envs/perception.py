@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from parkenv.engine.kernel import act_at, apply_observations_at, finish_step_at
+from parkenv.engine.kernel import act_at, apply_cues_at, apply_observations_at, finish_step_at
 from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.envs.sensors import SensingSearchEnv
-from parkenv.errors import require
+from parkenv.perception.departure_cues import DepartureCues, log_likelihood_ratio
 from parkenv.perception.detector import Detector
 from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
 from parkenv.perception.slot_filter import SlotObservation
@@ -49,14 +49,19 @@ class OnboardPerception:
         self.scenario = scenario
         self._view_starts, self._view_slots = scenario.slots_in_view
         self._rates = scenario.sensor_rates
+        self._cues = None if scenario.cues is None else DepartureCues(scenario.lot)
+        self._kept_s = scenario.cues.lead_s if scenario.cues else 0.0
         self.reset()
 
     def reset(self) -> None:
         self.results: tuple[PerceptionResult, ...] = ()
         self.observation = SlotObservation.none()
+        # By slot: the log-likelihood ratio of what was last seen of its car, and when.
+        self._evidence = np.zeros((2, self.scenario.lot.n_slots if self._cues else 0))
 
     def update_belief(self, address: int, vertex: int, captures: Sequence[TimedCapture]) -> None:
         """Run the pipeline on the captures of a step, oldest first, and update the belief."""
+        before = self.results[-1:]
         self.results, observed = self.pipeline.observe(captures)
         rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
         # The sensor model has rates only for slots within its range.
@@ -64,6 +69,24 @@ class OnboardPerception:
         rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
         self.observation = SlotObservation(observed.slots[used], observed.taken[used])
         apply_observations_at(address, *self.observation, rates.hit[rated], rates.false_alarm[rated])
+        if self._cues is not None:
+            self._update_cues(address, self._cues, (*before, *self.results)[-2:])
+
+    def _update_cues(self, address: int, cues: DepartureCues, newest: Sequence[PerceptionResult]) -> None:
+        """Update the belief in cars about to leave by what is new: successive pictures of a car err alike.
+
+        Cars that are no longer in the picture are not taken to have switched off their lamps.
+        """
+        (slots, taken), time = self.observation, newest[-1].captured.time
+        evidence = np.zeros(len(slots))
+        features = cues.features(newest, slots[taken])
+        known, at = self._evidence[:, slots]
+        known = np.where(taken & (time - at < self._kept_s), known, 0.0)
+        said = log_likelihood_ratio(features)
+        evidence[taken] = np.where(features[:, 0] > 0.0, said, np.maximum(said, known[taken]))
+        self._evidence[0, slots], self._evidence[1, slots] = evidence, time
+        new = evidence - known
+        apply_cues_at(address, slots, np.exp(np.minimum(new, 0.0)), np.exp(np.minimum(-new, 0.0)))
 
 
 class SearchPerceptionEnv(SensingSearchEnv):
@@ -103,7 +126,8 @@ class SearchPerceptionEnv(SensingSearchEnv):
     | `picture_width` | 400; a `SensorRig`'s own | px, width of the cameras' pictures; those of a survey have 640 |
 
     The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots
-    are not updated. If it is perfect, the fitted model of the rig replaces it (`SensorModel.named`).
+    are not updated. If it is perfect, the fitted model of the rig replaces it (`SensorModel.named`). With
+    `scenario.cues`, the cues are those in pictures and scans.
 
     `info` is that of `parkenv/Search-v2`. `env.unwrapped.perception` has the results of the last step: `results`
     (captures, detections, located cars, range scans) and `observation` (the observed slots and their states).
@@ -144,7 +168,6 @@ class SearchPerceptionEnv(SensingSearchEnv):
     ) -> None:
         require_changes((type(self),), changes)
         world = make_scenario(scenario, **changes)
-        require(world.cues is None, "cues of departures are not perceived; want a scenario without them")
         sensors = make_rig(rig, world, picture_width)
         self.perception = OnboardPerception(world, sensors, weather, captures, every, detector)
         super().__init__(self.perception.scenario, render_mode, observation, k, flat, reward_scale)

@@ -52,7 +52,7 @@ from parkenv.files.spec_file import (
     resolved_path,
 )
 from parkenv.files.user_class import find_module
-from parkenv.world.cues import Cues
+from parkenv.world.cues import SENSED, Cues
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
@@ -571,9 +571,9 @@ class SensorModelSpec(Spec):
 def _cues_table(text: str) -> dict[str, Any]:
     if text == "perfect":
         return {}
-    numbers = numbers_in(text)
+    numbers = SENSED if text == "sensed" else numbers_in(text)
     if len(numbers) not in (2, 3):
-        raise ValueError("perfect, or HIT,FALSE_ALARM[,LEAD_S]")
+        raise ValueError("perfect, sensed, or HIT,FALSE_ALARM[,LEAD_S]")
     return dict(zip(("hit_rate", "false_alarm_rate", "lead_s"), numbers, strict=False))
 
 
@@ -750,9 +750,9 @@ class ScenarioSpec(Spec):
     )
     cues: Annotated[Cues, _from_text(_cues_table), OrText()] | None = option(
         None,
-        "Cars show that they are about to leave. perfect: without error; or P(cue | about to leave) and P(cue | not) "
-        "at each observation, and the mean time before the departure, s.",
-        takes="perfect|HIT,FALSE_ALARM[,LEAD_S]",
+        "Cars show that they are about to leave. perfect: without error; sensed: as simulated sensors see it; or P(cue "
+        "| about to leave) and P(cue | not) at each observation, and the mean time before the departure, s.",
+        takes="perfect|sensed|HIT,FALSE_ALARM[,LEAD_S]",
         panel="World",
         default="none",
     )

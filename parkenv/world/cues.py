@@ -14,6 +14,8 @@ It is the mean of 220 drivers at a mall from the open door on, while a car waite
 (Ruback and Juieng, Territorial defense in parking lots, Journal of Applied Social Psychology 27, 1997).
 """
 
+SENSED = (0.026, 0.0014)
+"""Hit and false-alarm rate of the thresholded cues of simulated sensors: `tests/builders/departure_cues.py score`."""
 
 MOVING_S = 5.0
 """Time to move out of a slot, s: an assumption, the middle of 3 to 8."""
