@@ -184,7 +184,7 @@ def test_the_belief_after_perceived_cues_is_by_bayes_rule_and_successive_picture
         (slots, taken), excess = env.unwrapped.perception.observation, observation["cues"][:n]
         fresh = np.setdiff1d(slots[taken], np.flatnonzero(before))
         forecast, decay_rate, p = observation["belief"].reshape(4, -1)[:3]
-        usual = decay_rate * (1.0 - forecast) / observation["cues"][n:] * p
+        usual = decay_rate * (1.0 - forecast) / observation["cues"][n : 2 * n] * p
         after = 10.0 * usual / (10.0 * usual + 1.0 - usual)
         assert len(fresh) or len(before)
         np.testing.assert_allclose(excess[fresh], (after - usual)[fresh], rtol=1e-4)
