@@ -108,9 +108,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     An observation updates the belief in a slot by Bayes' rule; then the belief decays to the forecast:
     `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
 
-    `cues` has three parts: P(the car is about to leave) right after a slot was observed taken, beyond the usual; the
-    rate, 1/s, at which such a car leaves; and what the last step observed of it, as the logarithm of P(it | about to
-    leave) / P(it | not). They lower `p_occupied`, see `parkenv.belief.cue_belief`.
+    `cues` has three parts: P(about to leave), beyond the usual, after a slot was observed taken; the rate, 1/s, at
+    which such a car leaves; and what the last step observed, log P(it | about to leave) / P(it | not). See
+    `parkenv.belief.cue_belief`.
 
     ## Rewards
     Minus the duration of the step, s. Parking also subtracts the walk to the goal and the slot's parking cost
