@@ -22,6 +22,7 @@ from parkenv.lots.draft import LotDraft
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.fields import AgentSpec
 from parkenv.studies.fleet.drivers import policy_of
+from parkenv.world.cues import Cues
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, ListedArrivals, PoissonArrivals
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.facility import FACILITY_KINDS, KNOWN, Facility
@@ -347,11 +348,17 @@ def parks_at(env, slot):
     return env.step(PARK)
 
 
-def test_forbidden_slots_are_as_good_as_taken():
-    scenario = make_scenario(town(zone_rules=FORBIDDEN))
+@pytest.mark.parametrize("cues", [None, Cues(lead_s=1e6, moving_s=600.0)])
+def test_forbidden_slots_are_as_good_as_taken(cues):
+    scenario = make_scenario(town(zone_rules=FORBIDDEN)).replace(cues=cues)
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     observation, _ = env.reset(seed=0)
     forbidden = scenario.lot.slot_zone == "permit"
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        assert (observation["p_occupied"][forbidden] == 1.0).all()
+        observation, *_ = env.step(int(rng.choice(np.flatnonzero(observation["action_mask"][:4]))))
+    observation, _ = env.reset(seed=0)
     assert (observation["p_occupied"][forbidden] == 1.0).all()
     assert (observation["p_occupied"][~forbidden] < 1.0).all()
     assert scenario.action_masks[:10, PARK].tolist() == (~forbidden[:10]).tolist()

@@ -578,7 +578,7 @@ def is_about_to_leave(search: Any, column: int, time: float) -> bool:
 def leaves_in_s(search: Any, column: int, time: float) -> float:
     """Return how soon the car in a slot leaves, s, if it shows that it does; else infinity."""
     scenario, slot = scenario_at(search.scenario, 0), np.int64(slot_at(search.slots, column).slot)
-    if not is_taken(search, column, time):
+    if (search.n_forbidden > 0 and is_forbidden(search, slot)) or not is_taken(search, column, time):
         return np.inf
     key = search.key
     if scenario.world_kind == SHARED_KIND:
@@ -592,9 +592,12 @@ def leaves_in_s(search: Any, column: int, time: float) -> float:
 def in_the_way_s(search: Any, time: float) -> float:
     """Return for how long the car that moves out of the slot at the new vertex is in the way, s."""
     scenario = scenario_at(search.scenario, 0)
-    if search.vertex >= scenario.n_slots or scenario.world_kind == SHARED_KIND:
+    slot = search.vertex
+    if slot >= scenario.n_slots or scenario.world_kind == SHARED_KIND:
         return 0.0  # In fleets manoeuvres block lanes.
-    column = column_of(search, search.vertex)
+    if search.n_forbidden > 0 and is_forbidden(search, slot):
+        return 0.0
+    column = column_of(search, slot)
     left, record = leaves_in_s(search, column, time), slot_at(search.slots, column)
     # Its state is still to be observed: `observe_exact` takes a valid one for observed.
     record.valid_until, record.end_known = -np.inf, False
