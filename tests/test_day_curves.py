@@ -108,6 +108,21 @@ def test_a_holiday_is_known_from_the_year_before():
     assert np.abs(noon[:, second + 7] - noon[:, second - 7]).max() < 0.6
 
 
+def test_the_day_so_far_tells_of_its_rest(trained):
+    """Days differ in their level alone here, so that the morning says nearly all."""
+    counts, _, forecast = trained
+    days = slice(60, 140)
+    late = forecast.from_day(60)
+    given = late.given(counts, 9)
+    observed = counts.occupied[:, days]
+    np.testing.assert_allclose(given.occupancy[:, :, :9], observed[:, :, :9], atol=0.01)
+    before, after = (np.abs(f.occupancy - observed)[:, :, 9:].mean() for f in (late, given))
+    assert after < 0.5 * before
+    assert (given.sd[:, :, 9:] < 0.85 * late.sd[:, :, 9:]).all()
+    none = late.given(counts, 0)
+    np.testing.assert_allclose(none.mean, late.mean)
+
+
 def test_gaps_and_car_parks_without_readings_do_no_harm():
     counts, _ = car_parks(4, 90)
     occupied = counts.occupied.copy()

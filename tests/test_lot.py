@@ -251,7 +251,7 @@ def test_points_closer_than_the_tolerance_are_one_junction_wherever_they_lie():
     assert len(apart.vertex_xy) == 4
 
 
-@given(bearings=st.lists(st.floats(0.0, 2 * np.pi), min_size=1, max_size=4, unique_by=lambda b: round(b, 2)))
+@given(bearings=st.lists(st.floats(0.0, 6.27), min_size=1, max_size=4, unique_by=lambda b: round(b, 2)))
 def test_columns_are_the_best_assignment_of_bearings(bearings):
     ends = 50.0 * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
     graph = graph_of([([(0, 0), tuple(end)], TWO_WAY) for end in ends], entries=[(0, 0)])

@@ -97,6 +97,26 @@ class DayForecast:
         point = None if self.point is None else self.point[:, keep]
         return DayForecast(max(first, self.first), self.mean[:, keep], self.covariance[:, keep], point)
 
+    def given(self, counts: Counts, hour: int) -> DayForecast:
+        """Return the forecasts of the same days once the counts of the hours before `hour` have been seen.
+
+        Those hours keep what was seen, with no variance.
+        """
+        days = slice(self.first, self.first + self.mean.shape[1])
+        seen = counts.seen[:, days].copy()
+        seen[:, :, hour:] = np.nan
+        observed = np.isfinite(seen)
+        z = logits(seen, counts.sample[:, days, None])
+        v = self.covariance.astype(float)
+        within = np.where(observed[..., :, None] & observed[..., None, :], v, 0.0)
+        within[..., DIAGONAL, DIAGONAL] += np.where(observed, 1e-9, 1.0)
+        across = np.where(observed[..., None, :], v, 0.0)
+        gain = np.swapaxes(np.linalg.solve(within, np.swapaxes(across, -1, -2)), -1, -2)
+        mean = self.mean + (gain @ np.where(observed, z - self.mean, 0.0)[..., None])[..., 0]
+        rest = v - gain @ np.swapaxes(across, -1, -2)
+        rest[..., DIAGONAL, DIAGONAL] = np.maximum(rest[..., DIAGONAL, DIAGONAL], 0.0)
+        return replace(self, mean=mean, covariance=rest.astype(np.float32), point=None)
+
 
 class _Scale:
     def __init__(self, n: int) -> None:
