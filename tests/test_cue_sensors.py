@@ -193,6 +193,16 @@ def test_the_belief_after_perceived_cues_is_by_bayes_rule_and_successive_picture
         before = excess.copy()
 
 
+def test_a_step_without_captures_changes_nothing():
+    """A driven trip observes before it has moved."""
+    env = gym.make("parkenv/SearchPerception-v2", scenario=busy(), rig=RIG).unwrapped
+    before, _ = env.reset(seed=0)
+    env.perception.reset()
+    env.perception.update_belief(env._address, env.state.vertex, [])
+    assert len(env.perception.observation.slots) == 0
+    np.testing.assert_array_equal(env._observation(env.state.vertex)["cues"], before["cues"])
+
+
 def test_lamps_and_motion_are_evidence_that_a_car_leaves():
     leaving = Departure()
     rig, scenes = SensorRig.thesis().resized(400), leaving.scenes()

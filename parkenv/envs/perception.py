@@ -69,7 +69,7 @@ class OnboardPerception:
         rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
         self.observation = SlotObservation(observed.slots[used], observed.taken[used])
         apply_observations_at(address, *self.observation, rates.hit[rated], rates.false_alarm[rated])
-        if self._cues is not None:
+        if self._cues is not None and self.results:
             self._update_cues(address, self._cues, (*before, *self.results)[-2:])
 
     def _update_cues(self, address: int, cues: DepartureCues, newest: Sequence[PerceptionResult]) -> None:
