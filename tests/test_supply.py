@@ -104,7 +104,7 @@ zones = st.builds(
         st.builds(
             Facility,
             name=names.map(lambda name: f"P {name}"),
-            kind=st.sampled_from(FACILITY_KINDS),
+            kind=st.sampled_from(list(FACILITY_KINDS)),
             capacity=st.integers(1, 999),
             xy=st.tuples(st.floats(-50.0, 80.0), st.floats(-50.0, 50.0)),
             gate_s=st.floats(0.0, 60.0),

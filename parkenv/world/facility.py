@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -12,7 +12,21 @@ from parkenv.errors import InputError, require_one_of
 from parkenv.files.field_types import Name, NotNegative, Number, Validated, Whole
 from parkenv.world.drive_graph import GraphError, GraphProblem, nearest_legs
 
-FACILITY_KINDS = ("kerb", "lot", "garage")
+
+class FacilityKind(NamedTuple):
+    """What a kind of facility usually is, where a map does not say."""
+
+    color: str  # in pictures
+    gate_s: float = 0.0  # of a counted one, as in `Facility`
+    inside_s: tuple[float, float] = (10.0, 30.0)
+    known: str = "nothing"
+
+
+FACILITY_KINDS = {
+    "kerb": FacilityKind("#4477aa"),
+    "lot": FacilityKind("#228833"),
+    "garage": FacilityKind("#aa3377", gate_s=10.0, inside_s=(30.0, 120.0), known="sign"),
+}
 # What drivers know of a facility: what they find out by trying; a full sign in view; a live count everywhere.
 KNOWN = ("nothing", "sign", "live")
 FACILITY_REACH = 150.0  # greatest distance, m, of a counted facility's point from its lane

@@ -58,7 +58,7 @@ from parkenv.lots.town import supply
 from parkenv.lots.town.streets import BEYOND, read_streets
 from parkenv.lots.unread import Unread, note_unread, noting_unread, unread_rows
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
-from parkenv.world.facility import FACILITY_REACH
+from parkenv.world.facility import FACILITY_KINDS, FACILITY_REACH
 from parkenv.world.lot import Lane
 from parkenv.world.tariff import PUBLIC
 
@@ -339,12 +339,12 @@ class _TownImport(MapImport):
         for element, shape, area in (*outlines, *points):
             tags = element.tags
             rule = supply.rule_of(tags)
-            kind = "garage" if rule in supply.GARAGES else "lot"
+            kind = supply.RULES[rule].kind
             rules = supply.rules_of(tags)
             note_other_keys(tags)
             if rule == "boxes" and rules.users == PUBLIC:
                 rules = replace(rules, users="private")
-            xy = self._entrance(shape, entrances if kind == "garage" else [])
+            xy = self._entrance(shape, entrances if FACILITY_KINDS[kind].gate_s else [])
             if xy is None:
                 self.left_out[TOO_FAR].append(element.id)
                 continue
@@ -546,7 +546,7 @@ def _unseen_garages(
         return
     points = np.asarray(shapely.points(np.array(at)))
     alone = np.ones(len(points), bool)
-    garages = [a.polygon for a in parking if supply.rule_of(a.element.tags) in supply.GARAGES]
+    garages = [a.polygon for a in parking if supply.RULES[supply.rule_of(a.element.tags)].kind == "garage"]
     for outlines, reach in (([a.polygon for a in parking], ENTRANCE_WITHIN), (garages, SAME_GARAGE)):
         alone[shapely.STRtree(outlines).query(points, predicate="dwithin", distance=reach)[0]] = False
     index = np.flatnonzero(alone)
@@ -567,7 +567,7 @@ def _findings(
     length, kept, real = town.streets.length, town.streets.kept, ~town.streets.is_beyond
     connected = length[kept & real].sum() / length[real].sum()
     yield f"streets: {length.sum() / 1e3:.0f} km, {connected:.1%} of them connected; lanes: {len(draft.lanes)}"
-    for kind in ("kerb", "lot", "garage"):
+    for kind in FACILITY_KINDS:
         of_kind = [row for row in rows if row["kind"] == kind]
         places = dict.fromkeys(("tag", "drawn", "list", "register", "rule"), 0)
         for row in of_kind:

@@ -61,7 +61,7 @@ from parkenv.lots.osm.parking import (
 from parkenv.lots.osm.roads import SIDES, Rank, Road, Side, count_in
 from parkenv.lots.unread import note_unread
 from parkenv.world.drive_graph import linestrings
-from parkenv.world.facility import Facility
+from parkenv.world.facility import FACILITY_KINDS, Facility
 from parkenv.world.tariff import PUBLIC, Hours, Price, Zone
 from parkenv.world.week import DAY_S
 
@@ -251,22 +251,22 @@ class AreaRule(NamedTuple):
     power: float  # below 1 where large car parks need more ways
     levels: float  # number of levels where the tags do not say it
     typical: int  # places of one whose area is unknown
+    kind: str = "lot"  # kind of such facilities
 
 
-# Rule of each kind; fitted by `python tests/parking_rules.py`, which states the errors.
+# Rule of each kind; fitted by `python benchmarks/parking_rules.py`, which states the errors.
 RULES = {
     "surface": AreaRule(0.1847, 0.7882, 1.0, 7),
     "boxes": AreaRule(0.0574, 1.0, 1.0, 4),
-    "underground": AreaRule(0.0346, 1.0, 1.0, 30),
-    "multi-storey": AreaRule(0.0377, 1.0, 4.7, 350),
-    "rooftop": AreaRule(0.0342, 1.0, 1.0, 45),
+    "underground": AreaRule(0.0346, 1.0, 1.0, 30, "garage"),
+    "multi-storey": AreaRule(0.0377, 1.0, 4.7, 350, "garage"),
+    "rooftop": AreaRule(0.0342, 1.0, 1.0, 45, "garage"),
 }
 # Rule for each value of `parking`; `surface` for others.
 KINDS = {
     **dict.fromkeys(("garage", "garages", "garage_boxes", "carport", "carports", "sheds"), "boxes"),
     **{"underground": "underground", "multi-storey": "multi-storey", "rooftop": "rooftop"},
 }
-GARAGES = ("underground", "multi-storey", "rooftop")  # rules of what is a garage: it has a barrier and ramps
 
 
 def rule_of(tags: Mapping[str, str]) -> str:
@@ -290,9 +290,6 @@ def expected_capacity(rule: str, area: float | None, levels: float | None) -> in
     return max(int((a.places_of_square_metre * float(area * (levels or a.levels)) ** a.power) + 0.5), 1)
 
 
-GATE_S = 10.0  # s that the barrier of a garage takes for a car
-# Seconds from the entry of a counted facility to a space, when it is empty and when it is full.
-INSIDE_S = {"garage": (30.0, 120.0), "lot": (10.0, 30.0)}
 # Columns of the table of facilities: `capacity_from` is tag, drawn, list, register or rule, `rule` which one; `slots`
 # of the capacity are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a
 # kerb with its side.
@@ -320,6 +317,7 @@ class FacilityRow:
 
 
 def facilities_of(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
+    usual = FACILITY_KINDS[row.kind]
     if len(row.slots) and row.name in filled:
         yield Facility(row.name, row.kind, row.rules.zone(row.kind).name)
     for name, capacity, rules in row.counted if row.xy is not None else ():
@@ -329,9 +327,9 @@ def facilities_of(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
             rules.zone(row.kind).name,
             capacity,
             row.xy,
-            GATE_S if row.kind == "garage" else 0.0,
-            INSIDE_S.get(row.kind, INSIDE_S["lot"]),
-            "sign" if row.kind == "garage" else "nothing",
+            usual.gate_s,
+            usual.inside_s,
+            usual.known,
         )
 
 

@@ -39,6 +39,7 @@ from parkenv.show.scene import (
     posed,
 )
 from parkenv.show.tables import plural
+from parkenv.world.facility import FACILITY_KINDS
 from parkenv.world.lot import Lane, ParkingLot, corner_points, is_building, mouth_points
 
 TWO_WAY, ONE_WAY, TIE = "#333a42", "#aa3377", "#9aa0a6"
@@ -49,7 +50,6 @@ AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
 SLOT = "#9db8d2"
 # Colour of a slot by what its capacity is known from.
 KERB_COLORS = {"tag": "#225588", "register": "#225588", "drawn": "#4477aa", "rule": "#8fb8d8"}
-COUNTED_COLORS = {"lot": "#228833", "garage": "#aa3377", "kerb": "#4477aa"}
 STREET = "#8a8a84"
 SPACE_M2 = 60.0  # m² of a counted facility's disc for each place: twice the room of a parked car
 COLUMNS = 6
@@ -189,7 +189,7 @@ def _draw_town(town: TownDraft, ax: Axes, points_per_m: float) -> None:
             _dots(
                 ax, draft.slots.xy[sources == name], s=dot, color=color, linewidths=0, label=f"slots, {name}"
             )
-    for kind, color in COUNTED_COLORS.items():
+    for kind, (color, *_) in FACILITY_KINDS.items():
         for known in (True, False):
             facilities = [
                 facility
