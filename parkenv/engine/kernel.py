@@ -153,7 +153,7 @@ def step_exact_at(address: int, action: int) -> tuple[Any, ...]:
 @kernel
 def step_noisy_at(address: int, action: int) -> tuple[Any, ...]:
     search = search_at(address, 0)
-    drive_or_park(search, action)
+    act(search, action)
     if not search.parked:
         observe_otherwise(search)
     return complete_step(search)  # type: ignore[no-any-return]
@@ -164,7 +164,7 @@ def step_noisy_at(address: int, action: int) -> tuple[Any, ...]:
 
 @kernel
 def act_at(address: int, action: int) -> None:
-    drive_or_park(search_at(address, 0), action)
+    act(search_at(address, 0), action)
 
 
 @kernel
@@ -362,7 +362,7 @@ def clear_slots(search: Any) -> None:
 @inlined
 def take_step(search: Any, action: int) -> None:
     """Act, observe and add the costs; unlike `complete_step`, refresh neither the belief nor the clock."""
-    drive_or_park(search, action)
+    act(search, action)
     if not search.parked:
         observe(search)
     finish_step(search)
@@ -371,6 +371,16 @@ def take_step(search: Any, action: int) -> None:
 @inlined
 def write_clock(search: Any) -> None:
     search.clock[0], search.clock[1] = search.time, search.time - search.arrival
+
+
+@inlined
+def act(search: Any, action: int) -> None:
+    """Drive or park, and wait for a car that moves out of the slot at the new vertex; fleets block lanes instead."""
+    vertex, begin = search.vertex, search.time
+    drive_or_park(search, action)
+    if search.vertex != vertex and scenario_at(search.scenario, 0).moving_s > 0.0:
+        search.step_drive_s += in_the_way_s(search)
+        search.time = begin + search.step_drive_s
 
 
 @kernel
@@ -387,8 +397,6 @@ def drive_or_park(search: Any, action: int) -> None:
     target = edge.target
     if target != vertex:
         search.previous_vertex, search.vertex = vertex, target
-        if scenario.moving_s > 0.0:
-            search.step_drive_s += in_the_way_s(search, search.time + edge.seconds)
     elif action == PARK and vertex < scenario.n_slots:
         column = column_of(search, vertex)
         taken = is_taken(search, column, search.time)
@@ -589,16 +597,16 @@ def leaves_in_s(search: Any, column: int, time: float) -> float:
 
 
 @kernel
-def in_the_way_s(search: Any, time: float) -> float:
+def in_the_way_s(search: Any) -> float:
     """Return for how long the car that moves out of the slot at the new vertex is in the way, s."""
     scenario = scenario_at(search.scenario, 0)
     slot = search.vertex
-    if slot >= scenario.n_slots or scenario.world_kind == SHARED_KIND:
-        return 0.0  # In fleets manoeuvres block lanes.
+    if slot >= scenario.n_slots:
+        return 0.0
     if search.n_forbidden > 0 and is_forbidden(search, slot):
         return 0.0
     column = column_of(search, slot)
-    left, record = leaves_in_s(search, column, time), slot_at(search.slots, column)
+    left, record = leaves_in_s(search, column, search.time), slot_at(search.slots, column)
     # Its state is still to be observed: `observe_exact` takes a valid one for observed.
     record.valid_until, record.end_known = -np.inf, False
     return float(left if left <= scenario.moving_s else 0.0)

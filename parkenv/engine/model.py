@@ -28,8 +28,8 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of, call_at
 from parkenv.engine.batch import first_wrong
 from parkenv.engine.kernel import (
+    act,
     draw_departure,
-    drive_or_park,
     enter,
     finish_step,
     give_up,
@@ -572,7 +572,7 @@ def _probability_at(
     for e in range(len(p)):
         search = search_at(address, e)
         before = search.time
-        drive_or_park(search, action)
+        act(search, action)
         finish_step(search)
         write_clock(search)
         # Observed times are rounded.
