@@ -1,13 +1,12 @@
 """The search in a small lot as a file of Cassandra's format `.pomdp`, for solvers of others.
 
 `python examples/write_pomdp.py` writes `mini.pomdp`: each slot doubles the number of states, 12,289 for ten slots. It
-is the model of `exact`, with single moves: slots do not change, are taken independently of each other given the day,
-and are observed without error once they are in view. A state is the vertex of the car and the slots that are taken, or
-`done`; the day needs no states, as the probabilities of the states at the start contain it. Rewards are minus seconds.
+assumes that slots do not change, are taken independently of each other, and are observed without error once they are
+in view. A state is the vertex of the car and the slots that are taken, or `done`. Rewards are minus seconds.
 
-Two things keep the least expected cost to that of `exact`, which the script prints: at the start, a state of its own,
-the car has observed nothing yet and cannot park; and giving up in a lot that is not full costs so much that it is
-never optimal before every slot was observed. Solvers that want a discount below 1 find `DISCOUNT` at the top.
+Two things make the optimum that of a search: at the start, a state of its own, the car has observed nothing yet and
+cannot park; and giving up in a lot that is not full costs so much that it is never optimal before every slot was
+observed. Solvers that want a discount below 1 find `DISCOUNT` at the top.
 """
 
 from pathlib import Path
@@ -18,31 +17,28 @@ import numpy as np
 import parkenv
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.lot import ACTIONS, PARK
-from parkenv.world.occupancy.day_error import EXACT, DayError
-from planners.bounds.exact import Days, ExactSolution
-from planners.routes import RoadTable
+from planners.routes import DriveRoutes
 
 SCENARIO, SEED, DISCOUNT = "mini", 0, 1.0
 FILE = Path("mini.pomdp")
 
 
-def pomdp_lines(problem, p_occupied, vertex, day_error=EXACT, discount=1.0):
+def pomdp_lines(problem, p_occupied, vertex, discount=1.0):
     """Yield the lines of the search from a vertex in which no slot has been observed.
 
     Args:
         problem: lot, goal, speeds and costs; the sensor must not err, and every slot be in view of some vertex.
         p_occupied: (n_slots,) probability that each slot is taken; none is sure to be.
         vertex: where the car is.
-        day_error: how far days differ from the forecast; its level and slope are on a grid.
         discount: of each step.
     """
-    n, drive_s = problem.lot.n_slots, RoadTable.of(problem).seconds
-    days = Days.of(np.asarray(p_occupied, np.float64), problem.walk_s, day_error)
-    vertices = [int(v) for v in np.flatnonzero(np.isfinite(drive_s[vertex]))]
-    drives = drive_s[np.ix_(vertices, vertices)]
+    n, routes = problem.lot.n_slots, DriveRoutes(problem)
+    p_free = 1.0 - np.asarray(p_occupied, np.float64)
+    vertices = np.flatnonzero(np.isfinite(routes.seconds_from(vertex))).tolist()
+    drives = np.array([routes.seconds_from(v)[vertices] for v in vertices])
     # To see all slots saves no more than this, and what is unseen is free with at least some probability.
     longest_s = n * drives[np.isfinite(drives)].max() + problem.arrival_cost_s.max()
-    false_give_up_s = float((longest_s + problem.give_up_s) / days.p_free.min())
+    false_give_up_s = float((longest_s + problem.give_up_s) / p_free.min())
     # From a slot's own vertex the car could park before it has looked; elsewhere the start is a vertex as others are.
     vertices.sort(key=lambda v: v != vertex)
     places = [("start", vertex)] * bool(problem.action_masks[vertex, PARK]) + [(f"v{v}", v) for v in vertices]
@@ -56,14 +52,13 @@ def pomdp_lines(problem, p_occupied, vertex, day_error=EXACT, discount=1.0):
         if action != PARK:
             return int(problem.edges[v, action]["target"]), float(problem.edges[v, action]["seconds"])
         if place == "start" or not problem.action_masks[v, PARK]:
-            # The car waits; `exact` lets it do so where a move is missing.
+            # The car waits, at a vertex where a move is missing.
             return v, problem.wait_s if (problem.lot.neighbors[v] < 0).any() else false_give_up_s
         return (v, problem.failure_s) if taken >> v & 1 else (-1, float(problem.arrival_cost_s[v]))
 
-    chances = days.chance[None, :]  # of each set of taken slots, on each day
-    for free in days.p_free:
-        chances = np.concatenate([chances * free, chances * (1.0 - free)])
-    start = chances.sum(axis=1) / chances.sum()
+    start = np.ones(1)  # the probability of each set of taken slots
+    for free in p_free:
+        start = np.concatenate([start * free, start * (1.0 - free)])
     yield "# State vV_BITS: the car is at vertex V (start: has not looked yet); slot i is taken where bit i is 1."
     yield "# Observation seen_BITS: which of the slots in view of the vertex are taken, in their order; then zeros."
     yield f"discount: {discount}"
@@ -90,13 +85,9 @@ def pomdp_lines(problem, p_occupied, vertex, day_error=EXACT, discount=1.0):
 
 
 if __name__ == "__main__":
-    scenario = parkenv.make_scenario(SCENARIO)
+    scenario = parkenv.make_scenario(SCENARIO, day_error=0.0)
     observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=SEED)
     belief, vertex = SlotBelief.of_observation(observation), int(observation["vertex"])
-    problem, day_error = scenario.public(), DayError(*map(float, belief.day_error))
-    lines = pomdp_lines(problem, belief.forecast, vertex, day_error, DISCOUNT)
+    lines = pomdp_lines(scenario.public(), belief.forecast, vertex, DISCOUNT)
     FILE.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
-    exact = ExactSolution(problem, belief.forecast, vertex, day_error=day_error)
-    print(
-        f"{FILE}: {FILE.stat().st_size / 1e6:.1f} MB; least expected time, by exact: {exact.expected_s:.6f} s"
-    )
+    print(f"{FILE}: {FILE.stat().st_size / 1e6:.1f} MB")

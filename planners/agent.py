@@ -199,8 +199,8 @@ def agent_options(name: str) -> tuple[str, ...]:
     """Return the names of the options that an agent has; none if it comes from a file.
 
     Examples:
-        >>> agent_options("exact")
-        ('most_states',)
+        >>> agent_options("oracle")
+        ()
     """
     before, colon, _ = name.partition(":")
     if colon and before in FILE_AGENTS:

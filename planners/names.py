@@ -17,7 +17,6 @@ AGENTS: dict[str, tuple[str, str]] = {
     "rollout": ("planners.rollout", "RolloutAgent"),
     "network": ("planners.network.agent", "NetworkAgent"),
     "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
-    "exact": ("planners.bounds.exact", "ExactAgent"),
     "bound": ("planners.bounds.relaxation", "SearchBound"),
 }
 # Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model.
@@ -32,6 +31,5 @@ HUMAN = "human"  # the agent that repeats what a person did in a game of `parken
 FILE_AGENTS = (*ALGORITHMS, NETWORK, HUMAN)  # names before the colon of `NAME:FILE`
 # Agents that make no use of an occupancy forecast.
 WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "greedy-total", "first-free", "random", "oracle")
-SMALL_LOTS_ONLY = ("exact",)  # agents for small lots and sensors without errors only
 BOUND = "bound"  # what no agent can beat in the mean; it drives no car
-AGENT_NAMES = tuple(name for name in AGENTS if name not in (*SMALL_LOTS_ONLY, BOUND))  # agents for all lots
+AGENT_NAMES = tuple(name for name in AGENTS if name != BOUND)

@@ -2,7 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Iterator
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +20,27 @@ from planners.thesis.label_setting import edges_in
 _KEPT_TARGETS = 64
 _CHEAPER = 6  # about how many rows of next vertices take as long as one of drive times
 _NONE = -1
-NOWHERE = np.zeros(0, dtype=np.bool_)
+_NOWHERE = np.zeros(0, dtype=np.bool_)
 
 
 class DriveRoutes:
     def __init__(self, problem: SearchProblem) -> None:
         # Copies: numba would compile every function again for read-only arrays.
         self._neighbors, self._move_s = problem.lot.neighbors.copy(), problem.move_cost_s.copy()
-        # Edges as `search` takes them, outward and inward.
-        self.edges = edges_out(self._neighbors, self._move_s)
+        # Edges as `_search` takes them, outward and inward.
+        start = np.arange(0, self._neighbors.size + 1, len(MOVES), dtype=np.int32)
+        self._edges_out = start, self._neighbors.flatten(), self._move_s.flatten()
         start, source, _, seconds = edges_in(self._neighbors, self._move_s)
         self._edges_in = start, source, seconds
         self._moves: OrderedDict[int, dict[int, int]] = OrderedDict()
 
-    def seconds_from(self, vertex: int, walls: NDArray[np.bool_] = NOWHERE) -> FloatArray:
+    def seconds_from(self, vertex: int, walls: NDArray[np.bool_] = _NOWHERE) -> FloatArray:
         """Return the drive time, (n_vertices,) s, from a vertex to every other; inf where unreachable.
 
         No drive leads through `walls`, (n_vertices,) bool, or none.
         """
         seconds = np.full(len(self._neighbors), np.inf)
-        search(*self.edges, vertex, NOWHERE, walls, seconds)
+        _search(*self._edges_out, vertex, _NOWHERE, walls, seconds)
         return seconds
 
     def nearest(self, vertex: int, slots: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float]:
@@ -48,7 +49,7 @@ class DriveRoutes:
         They are (k,) int64, ascending; none and inf if none is reachable.
         """
         seconds = np.full(len(self._neighbors), np.inf)
-        reached = search(*self.edges, vertex, slots, NOWHERE, seconds)
+        reached = _search(*self._edges_out, vertex, slots, _NOWHERE, seconds)
         if reached == _NONE:
             return np.empty(0, dtype=np.int64), np.inf
         least = float(seconds[reached])
@@ -84,7 +85,7 @@ class DriveRoutes:
         end = np.zeros(vertex + 1, dtype=np.bool_)
         end[vertex] = True
         moves: dict[int, int] = {}
-        if search(*self._edges_in, target, end, NOWHERE, seconds) == _NONE:
+        if _search(*self._edges_in, target, end, _NOWHERE, seconds) == _NONE:
             return moves
         while vertex != target:
             following = self._neighbors[vertex]
@@ -94,16 +95,8 @@ class DriveRoutes:
         return moves
 
 
-def edges_out(
-    neighbors: NDArray[np.int32], move_s: FloatArray
-) -> tuple[NDArray[np.int32], NDArray[np.int32], FloatArray]:
-    """Return the edges as `search` takes them: copies, since numba compiles again for read-only arrays."""
-    start = np.arange(0, neighbors.size + 1, len(MOVES), dtype=np.int32)
-    return start, neighbors.flatten(), move_s.flatten()
-
-
 @compiled(error_model="numpy")
-def search(
+def _search(
     start: NDArray[np.int32],
     leads_to: NDArray[np.int32],
     edge_s: FloatArray,
@@ -155,10 +148,6 @@ class RoadTable:
         self._matrix: Any = csr_matrix((drive[first], (source[first], target[first])), shape=(n, n))
         self._seconds, self._following = np.empty((n, n)), np.empty((n, n), np.int16)
         self._ready = 0, 0  # rows of seconds, and, after all of them, of following
-
-    @classmethod
-    def of(cls, problem: SearchProblem) -> Self:
-        return cls(problem.lot.neighbors, problem.move_cost_s)
 
     @property
     def seconds(self) -> FloatArray:

@@ -6,7 +6,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from expected_time import expected_time
+from expected_time import expected_time, optimum_s
 from small_lots import cut_in_two, features, full_lot, lasting, small_lot
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel, make_scenario
@@ -27,13 +27,12 @@ from planners import make_agent
 from planners.belief.agent import WORK_PER_MS
 from planners.belief.best_path import best_path
 from planners.belief.planning_graph import MOST_STOPS
-from planners.bounds.exact import ExactSolution
 
 
 def gap(seed, **options):
     """How much longer than the optimum it takes on a random small lot whose map is right, %."""
     problem, p, entry = small_lot(seed)
-    best = ExactSolution(problem, p.astype(np.float32), entry).expected_s
+    best = optimum_s(problem, p.astype(np.float32), entry)
     agent = make_agent("belief", problem, **options)
     return 100.0 * (expected_time(agent, problem, p, entry) / best - 1.0)
 

@@ -92,7 +92,7 @@ def test_a_page_is_one_small_file_that_needs_nothing_else_and_is_made_again_the_
 def test_searches_of_the_run_can_be_chosen(run, tmp_path):
     for options, message in (
         (ReportOptions(numbers=(99,)), "99; .* 7 to 10"),
-        (ReportOptions(agents=("belief", "exact")), "'exact'; known: mdp, belief"),
+        (ReportOptions(agents=("belief", "usual")), "'usual'; known: mdp, belief"),
     ):
         with pytest.raises(InputError, match=message):
             make_report(run, ExecutionSpec(), options, out=tmp_path / "x.html")

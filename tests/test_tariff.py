@@ -202,7 +202,7 @@ def priced(lot, cost_s):
 
 @pytest.mark.parametrize(
     "name",
-    "mdp mdp-static mdp-tuned belief exact oracle greedy-goal greedy-total first-free".split(),
+    "mdp mdp-static mdp-tuned belief oracle greedy-goal greedy-total first-free".split(),
 )
 def test_agents_park_elsewhere_where_that_pays(name):
     lot = packaged_lot("mini")

@@ -79,7 +79,6 @@ SHARED = (
     Column("gave_up_fraction", "found no slot", share=True, help="Searches that gave up; charged the penalty",
            needs="gave_up_fraction"),
     Column("difference_s", "change from the first agent", "s", signed=True, help="Paired by world; 95 % interval"),
-    Column("gap_to_exact", "above the optimum", share=True, digits=2, signed=True),
     Column("gap_to_bound", "above the best possible, at most", share=True, digits=1),
     Column("regret_s", "regret (above the bound)", "s", help="Difference to the clairvoyant lower bound"),
     *(

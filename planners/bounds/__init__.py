@@ -1,1 +1,1 @@
-"""Bounds on the performance of any agent: the clairvoyant bound, the oracle, and exact solutions for small lots."""
+"""Bounds on the performance of any agent: the clairvoyant bound, the oracle, and an information relaxation."""

@@ -25,7 +25,6 @@ EQUAL_COSTS = 1e-4  # v_walk/v_drive at which a and b are equal to one in ten th
 THESIS_SPEEDS = 0.4  # v_walk/v_drive of the thesis, 4 and 10 km/h
 CHANCES = (0.5, 0.75, 0.8, 0.85, 0.9, 0.95, 0.99)
 FOREVER_S = 1e12  # mean stay, s, of a world in which nothing changes
-PIECE = 16  # slots of a piece of the line that `exact` solves at once
 BEYOND_ASKED = 10  # slots beyond the goal for which agents are asked whether they take them
 
 
@@ -77,18 +76,15 @@ class Line:
         reached = np.concatenate([[1.0], np.cumprod(1.0 - chance)[:-1]])
         return float((reached * chance * cost_s).sum() / (reached * chance).sum())
 
-    def problem(self, slots=slice(None), rest_s=0.0):
+    def problem(self):
         kerb_y = -ONE_WAY_HALF_WIDTH
         west, east = (self.before + 0.5) * -PITCH, (self.beyond + 0.5) * PITCH
         row = kerb_rows(np.array([[west, kerb_y]]), np.array([[east, kerb_y]]), np.array([False]))[0]
-        numbers = np.arange(self.n_slots)[slots]
-        cost_s, chosen = np.zeros(len(numbers)), row[numbers]
-        cost_s[-1] = rest_s
-        entry = np.array([[chosen.xy[0, 0] - PITCH, 0.0]])
+        entry = np.array([[row.xy[0, 0] - PITCH, 0.0]])
         lot = ParkingLot(
             name="line",
-            slot_ids=tuple(str(self.before - i) for i in numbers),
-            **chosen.columns() | {"slot_parking_cost_s": cost_s},
+            slot_ids=tuple(str(self.before - i) for i in range(self.n_slots)),
+            **row.columns(),
             lanes=(Lane(np.array([entry[0], [east + PITCH, 0.0]]), oneway=True),),
             entries=entry,
             goals=np.array([[0.0, row.xy[0, 1]]]),
@@ -144,35 +140,8 @@ def takes_of(name, line, **options):
     return takes
 
 
-def exact_takes(line):
-    """Return which free slots of a line `exact` takes, (n,) bool.
-
-    It solves lots of up to 25 slots. Without a way back, what follows a piece of the line does not depend on what was
-    observed in it. So the rest of the line is one more slot, which is always free and costs as much as the rest takes.
-    For pieces before the goal it is at the goal, since a car that drives on has not parked before the piece ends.
-    """
-    takes = np.ones(line.n_slots, np.bool_)
-    rest_s, end = 0.0, line.n_slots - 1
-    while end > 0:
-        start, rest = max(0, end - PIECE), max(end, line.before)
-        numbers = np.append(np.arange(start, end), rest)
-        problem = line.problem(numbers)
-        if end < line.n_slots - 1:
-            own_s = (rest - end) * PITCH / problem.v_drive + problem.walk_s[-1]
-            problem = line.problem(numbers, rest_s - own_s)
-        agent = make_agent("exact", problem)
-        p_occupied = np.append(np.full(end - start, line.q), 0.0)
-        takes[start:end] = free_slots_taken(agent, problem, p_occupied, end - start)
-        belief = SlotBelief.of_forecast(p_occupied, np.zeros(len(numbers)))
-        _, memory = agent.predict(observation(problem, int(problem.lot.entry_vertices[0]), belief))
-        rest_s = memory.solution.expected_s - PITCH / problem.v_drive
-        end = start
-    return takes
-
-
 def threshold(agent, line, **options):
-    takes = exact_takes(line) if agent == "exact" else takes_of(agent, line, **options)
-    return threshold_of(takes, line.before)
+    return threshold_of(takes_of(agent, line, **options), line.before)
 
 
 def cost_ratio(line):
@@ -196,11 +165,11 @@ def thresholds():
     apart, driving on saves the walk but costs the drive: \(a = d\,(1/v_w - 1/v_d)\), \(b = d\,(1/v_w + 1/v_d)\), and
     \(a/(a+b) = (1 - v_w/v_d)/2\); `a = b` has \(v_w/v_d = 10^{-4}\).
 
-    Agents drive past taken slots, and beside each one they are asked what they would do were it free. `exact` solves
-    the line in pieces of 16 slots. `belief` looks ahead at most 400 stops, so at \(q = 0.99\) its rule may cost 0.2 %
-    more than the best one. The thesis's `mdp` plans to attempt one slot until it is free, which costs \(c\,q/(1-q)\)
-    more than a slot known to be free, \(c\) the failure cost; the best such slot is at the goal, so it takes a free
-    slot at \(r\) if and only if \(ar \le c\,q/(1-q)\). At \(c = a\,(r + \frac12)(1-q)/q\) both rules are equal; no
+    Agents drive past taken slots, and beside each one they are asked what they would do were it free. `belief` looks
+    ahead at most 400 stops, so at \(q = 0.99\) its rule may cost 0.2 % more than the best one. The thesis's `mdp` plans
+    to attempt one slot until it is free, which costs \(c\,q/(1-q)\) more than a slot known to be free, \(c\) the
+    failure cost; the best such slot is at the goal, so it takes a free slot at \(r\) if and only if \(ar \le
+    c\,q/(1-q)\). At \(c = a\,(r + \frac12)(1-q)/q\) both rules are equal; no
     \(c\) fits all \(q\).
     """
     made = []
@@ -209,7 +178,6 @@ def thresholds():
         name = f"q = {q:g}, {'a = b' if ratio == EQUAL_COSTS else '4 and 10 km/h'}:"
         far = q > 0.97
         best = {"failure_s": line.best_failure_s, "gamma": 1.0}
-        made.append(Statement(f"{name} exact, threshold", line.threshold, partial(threshold, "exact", line)))
         made.append(
             Statement(
                 f"{name} belief, mean cost over the least", 1.0, partial(cost_ratio, line), 0.002, slow=True
@@ -249,7 +217,6 @@ def searches():
             slow=True,
         )
         for name, line, first, n, options in (
-            ("exact", SHORT, 0, 1000, {}),
             ("mdp", SHORT, 8000, 1000, cautious),
             ("belief", LONGER, 0, 500, {"day": False}),
         )

@@ -49,7 +49,6 @@ AGENT_COLORS = {
     "bound": "#8c564b",
     "belief": "#cc79a7",
     "belief-rivals": "#661100",
-    "exact": "#882255",
     "network": "#44aa99",
     "rollout": "#4b5d16",
     "dqn": "#999933",

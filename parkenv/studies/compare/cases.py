@@ -211,8 +211,8 @@ def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
 def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]) -> list[Row]:
     """Return a row for every case with finished episodes, in order; differences are to the first agent.
 
-    If some agents plan for a given time, `planner` and `budget_ms` tell the two apart. If `exact` or `bound` is among
-    the agents, `gap_to_exact` and `gap_to_bound` are the relative excesses of an agent's mean time over theirs.
+    If some agents plan for a given time, `planner` and `budget_ms` tell the two apart. If `bound` is among the agents,
+    `gap_to_bound` is the relative excess of an agent's mean time over its.
     """
     rows, cells = [], list(cells)
     by_setting: dict[tuple[Any, ...], list[tuple[Row, list[Row]]]] = {}
@@ -235,12 +235,11 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
     for agents in by_setting.values():
         _mark_leaders(agents)
     names = [c for c in SETTING_COLUMNS if c != "agent"]
-    for least in ("exact", BOUND):
-        optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == least}
-        for row in rows:
-            best = optimum.get(tuple(row[c] for c in names))
-            if best is not None:
-                row[f"gap_to_{least}"] = row["total_s"] / best - 1.0
+    bounds = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == BOUND}
+    for row in rows:
+        bound = bounds.get(tuple(row[c] for c in names))
+        if bound is not None:
+            row["gap_to_bound"] = row["total_s"] / bound - 1.0
     return rows
 
 

@@ -55,7 +55,7 @@ LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)  # occupancy levels of the command
 # Failure costs of `--failure-cost sweep`, s.
 FAILURE_COST_SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
 # Agents that require observations of slots before an attempt.
-NEEDS_OBSERVATIONS = ("belief", "belief-rivals", "mdp-tuned", "exact", "network")
+NEEDS_OBSERVATIONS = ("belief", "belief-rivals", "mdp-tuned", "network")
 # Separator between the name of a scenario and the constant probability of its forecast.
 CONSTANT_FORECAST = "-constant-forecast-"
 
@@ -137,7 +137,7 @@ class CaseStudy(Study):
     shown: ClassVar = {
         "rows": (
             "scenario", "blind", *SETTING_AXES, "agent", "episodes", "total_s", "median_s", "gave_up_fraction",
-            "difference_s", "regret_s", "gap_to_exact", "gap_to_bound", *COST_FIELDS, "parked_fraction", "replans",
+            "difference_s", "regret_s", "gap_to_bound", *COST_FIELDS, "parked_fraction", "replans",
             "decision_ms", "decision_ms_p99",
         )
     }  # fmt: skip
