@@ -118,9 +118,8 @@ def _arrays(item: Any) -> Any:
     return array
 
 
-# In compiled code, `float32_array(address, (m, n))` is the array at an address.
-float64_array, float32_array = _arrays(types.float64), _arrays(types.float32)
-int64_array, int32_array, int16_array = _arrays(types.int64), _arrays(types.int32), _arrays(types.int16)
+# In compiled code, `float64_array(address, (m, n))` is the array at an address.
+float64_array, int64_array, int32_array = _arrays(types.float64), _arrays(types.int64), _arrays(types.int32)
 uint8_array = _arrays(types.uint8)
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.network import compiled_network
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import atomic_write
@@ -45,10 +44,8 @@ def policy_of(
 ) -> tuple[CompiledPolicy | None, Any]:
     """Return the compiled policy of an agent, or else the agent itself, which decides in Python.
 
-    Heuristics and trained networks without memory and normalization are compiled. Networks of policies (ppo,
-    maskable-ppo) draw their actions, as in training, so that equal cars do not all do the same; the draws follow from
-    the world and the car. An agent that expects rivals gets how many cars arrive in an hour, if that is a number, as by
-    a forecast of traffic.
+    Heuristics are compiled. An agent that expects rivals gets how many cars arrive in an hour, if that is a number, as
+    by a forecast of traffic.
     """
     if not spec.options and spec.name in POLICIES:
         return POLICIES[spec.name], None
@@ -61,38 +58,9 @@ def policy_of(
         not isinstance(agent, ClairvoyantAgent),
         f"agent {spec.label!r} knows the future of single searches, and drives no fleet",
     )
-    plain = isinstance(agent, LearnedAgent) and not agent.normalization.tensors
-    if isinstance(agent, LearnedAgent) and plain and agent.card.algorithm != "recurrent-ppo":
-        sampled = agent.card.algorithm != "dqn"
-        return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     if isinstance(agent, LearnedAgent) or not scenario.has_rules:
         return None, agent  # learned agents observe costs themselves
     return None, AgentsByStay(spec, scenario, known)
-
-
-def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "network") -> CompiledPolicy:
-    """Return a policy of stable-baselines3 or sb3-contrib, for `local` observations of k slots, as a compiled driver.
-
-    It draws its actions if `sampled`, instead of taking the most probable one.
-    """
-    from torch import nn
-
-    if hasattr(policy, "q_net"):
-        parts = list(policy.q_net.q_net)
-    elif hasattr(policy, "mlp_extractor") and not hasattr(policy, "lstm_actor"):
-        parts = [*policy.mlp_extractor.policy_net, policy.action_net]
-    else:
-        parts = []
-    linear = [part for part in parts if isinstance(part, nn.Linear)]
-    others = {type(part).__name__.lower() for part in parts if not isinstance(part, nn.Linear)}
-    require(
-        linear and len(others) <= 1 and (others <= {"tanh", "relu"}),
-        f"policy is a {type(policy).__name__} with {', '.join(sorted(others)) or 'no layers'}, want a multilayer "
-        "perceptron of PPO, MaskablePPO or DQN with tanh or relu",
-    )
-    layers = [(part.weight.detach().cpu().numpy(), part.bias.detach().cpu().numpy()) for part in linear]
-    activation, masked = others.pop() if others else "tanh", type(policy).__name__.startswith("Maskable")
-    return compiled_network(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
 
 
 def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
