@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ordered_entry import ORDERED_ENTRY
+from sb3_contrib import MaskablePPO
 from small_lots import driven, small_lot
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 from test_counted_occupancy import counted
 from test_search_reference import recorded_scenario
 
@@ -335,14 +336,25 @@ MINI = make_scenario("mini")
 DEMAND = Demand(PoissonArrivals(60.0, 8 * 3600, 8.5 * 3600), ExponentialTime(480.0), ConstantTime(300.0))
 
 
-def test_a_trained_model_drives_the_cars_of_a_fleet(tmp_path):
-    model = PPO("MultiInputPolicy", SearchVecEnv(3, "mini"), seed=0, device="cpu")
-    save_model(model, tmp_path / "model.safetensors")
-    policy, agent = policy_of(AgentSpec(name=f"ppo:{tmp_path / 'model.safetensors'}"), MINI)
-    assert policy is None
-    fleet = Fleet(MINI, DEMAND, max_steps=4, leave_full_lot=False)
-    fleet.reset(0)
-    car = fleet.next_decision()
-    action, _ = model.predict(fleet.local_observation(car), deterministic=True)
-    assert agent.predict(fleet.local_observation(car))[0] == action
-    assert (driven(fleet, 3, agents=[agent]).cars["n_steps"] > 0).all()
+def small(algorithm):
+    policy = {"net_arch": [16, 8]}
+    venv = SearchVecEnv(3, "mini")
+    return algorithm("MultiInputPolicy", venv, seed=0, device="cpu", policy_kwargs=policy)
+
+
+@pytest.mark.parametrize(("name", "algorithm"), [("ppo", PPO), ("maskable-ppo", MaskablePPO), ("dqn", DQN)])
+def test_a_trained_model_drives_every_car_by_its_own_observation(name, algorithm, tmp_path):
+    model = small(algorithm)
+    path = tmp_path / "model.safetensors"
+    save_model(model, path)
+    none, agent = policy_of(AgentSpec(name=f"{name}:{path}"), MINI)
+    assert none is None
+    fleet = Fleet(MINI, DEMAND, drivers=[DriverKind()], max_steps=60, leave_full_lot=False)
+    fleet.reset(3)
+    while (car := fleet.next_decision()) is not None:
+        observation = fleet.local_observation(car)
+        masks = {"action_masks": observation["action_mask"]} if algorithm is MaskablePPO else {}
+        fleet.act(model.predict(observation, deterministic=True, **masks)[0])
+    expected = fleet.cars[["total_s", "n_steps", "slot"]].copy()
+    actual = driven(fleet, 3, agents=[agent]).cars[["total_s", "n_steps", "slot"]]
+    np.testing.assert_array_equal(actual, expected)
