@@ -61,7 +61,7 @@ def test_a_help_page_says_what_a_newcomer_needs(path, command, monkeypatch):
 
 
 OPTIONAL = (
-    "address", "agents", "around", "bounds", "calibrated", "car_park", "clone", "crops", "drives", "lot",
+    "address", "agents", "around", "bounds", "calibrated", "car_park", "crops", "drives", "lot",
     "constant_forecast", "model", "labels", "picture", "replay", "rig", "scenario", "simulated", "uiuc",
 )  # fmt: skip
 """Options that do nothing unless they are given."""

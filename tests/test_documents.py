@@ -112,6 +112,7 @@ FEWER = {
     r"DECISIONS, ROUNDS, TASKS = 20_000, 10, 50": "DECISIONS, ROUNDS, TASKS = 1_100, 1, 2",
     r"(DECISIONS, EPOCHS, BATCH) = 2_000, 8": r"\1 = 50, 2",
     r"WORLDS = 40": "WORLDS = 2",
+    r"(SEARCHES, UPDATES, DECISIONS, WORLDS) = .*": r"\1 = 2, 2, 4_096, 2",
     r"SCENES, DEADLINE_S = 10, 3.0": "SCENES, DEADLINE_S = 1, 1.0",
     r"model.learn\(4_096\)\n    observations": "model.learn(1_024)\n    observations",
 }

@@ -34,7 +34,6 @@ class Counter(Observer):
         self.calls = []
         self.on_reset = lambda _, observation: self.calls.append(("reset", observation))
         self.on_step = lambda step: self.calls.append(("step", step))
-        self.on_end = lambda result: self.calls.append(("end", result))
 
 
 class Waiting:
@@ -48,11 +47,10 @@ class Waiting:
 def test_observers_see_the_whole_episode_in_order(name):
     env, one, two = gym.make("parkenv/Search-v2", scenario=MINI), Counter(), Counter()
     result = simulate(env, make_agent(name, MINI), 5, (one, two))
-    assert [call for call, _ in one.calls] == ["reset", *["step"] * result.steps, "end"]
-    assert [call for call, _ in two.calls] == ["reset", *["step"] * result.steps, "end"]
-    (_, first), *steps, (_, ended) = one.calls
+    assert [call for call, _ in one.calls] == ["reset", *["step"] * result.steps]
+    assert [call for call, _ in two.calls] == ["reset", *["step"] * result.steps]
+    (_, first), *steps = one.calls
     steps = [step for _, step in steps]
-    assert ended is result
     assert (result.seed, result.truncated) == (5, False)
     assert steps[0].observation is first
     for before, after in itertools.pairwise(steps):
@@ -73,7 +71,7 @@ def test_a_search_is_truncated_and_charged_once_unless_it_parks_at_the_step_limi
     assert result.steps == 7
     assert result.info["gave_up_s"] == MINI.give_up_s
     assert result.info["total_s"] == pytest.approx(7 * MINI.wait_s + MINI.give_up_s)
-    assert counter.calls[-2][1].info["gave_up_s"] == 0.0, "the environment's own info stays as it is"
+    assert counter.calls[-1][1].info["gave_up_s"] == 0.0, "the environment's own info stays as it is"
     env = gym.make("parkenv/Search-v2", scenario=MINI)
     agent = make_agent("first-free", MINI)
     free = simulate(env, agent, 3)

@@ -28,10 +28,10 @@ from parkenv.errors import InputError
 from parkenv.lots import grid_lot
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.runner import run
-from parkenv.studies.training.configs import MAX_STEPS, SEARCH_CONFIGS
+from parkenv.studies.training.configs import SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.spec import TrainingSpec
-from parkenv.studies.training.training import TRAINING_SEEDS, Demonstrations, clone, episode_times
+from parkenv.studies.training.training import TRAINING_SEEDS, episode_times
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
 from planners.agent import make_agent
@@ -128,45 +128,6 @@ def test_seeds_decide_networks_and_worlds(tmp_path, monkeypatch):
     assert seeds[1::2] == [TRAINING_SEEDS, 2 * TRAINING_SEEDS], "worlds apart from those of evaluations"
     models = [(tmp_path / seed / "model.safetensors").read_bytes() for seed in "01"]
     assert models[0] != models[1]
-
-
-class Waits:
-    """Never moves."""
-
-    def predict(self, observation, state=None):
-        return int(np.flatnonzero(observation["action_mask"] == 0)[0]), state
-
-
-def test_cloning_wants_finished_searches_and_takes_the_read_only_arrays_of_a_worker(monkeypatch):
-    monkeypatch.setattr("parkenv.studies.training.training.make_agent", lambda *_: Waits())
-    with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to clone"):
-        Demonstrations.collect("waits", SCENARIO, [5_000_000])
-    monkeypatch.undo()
-    shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
-    for array in (shown.local, shown.masks, shown.actions, shown.times):
-        array.flags.writeable = False
-    model = PPO("MultiInputPolicy", SearchVecEnv(2, "mini"), n_steps=8, batch_size=16, seed=0)
-    before = model.policy.action_net.weight.clone()
-    clone(model, shown, 0, updates=1)
-    assert not torch.equal(before, model.policy.action_net.weight)
-
-
-@pytest.mark.slow
-def test_cloning_begins_near_the_planner():
-    campus = make_scenario("campus")
-    shown = Demonstrations.collect("first-free", campus, range(5_000_000, 5_000_300))
-    assert shown.local.shape == (len(shown.actions), 86)
-    assert (shown.masks[np.arange(len(shown.actions)), shown.actions] == 1).all()
-    assert (shown.times > 0.0).all()
-    venv = SearchVecEnv(4, campus, reward_scale=0.01, max_episode_steps=MAX_STEPS)
-    model = MaskablePPO("MultiInputPolicy", venv, seed=0, policy_kwargs={"net_arch": [64, 64]})
-    fresh, _ = episode_times(model, campus, EVALUATED)
-    clone(model, shown, 0, updates=2000)
-    cloned, _ = episode_times(model, campus, EVALUATED)
-    planner = [row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)]
-    # The mean would be of those few searches in which a clone drives in circles; on empty days any agent parks soon.
-    cloned_s, planner_s, fresh_s = (np.quantile(times, 0.75) for times in (cloned, planner, fresh))
-    assert cloned_s < 1.2 * planner_s < fresh_s
 
 
 def test_a_model_decides_on_driven_trips(trained):

@@ -64,7 +64,6 @@ _TABLES = (".toml", ".json")
 COMPLETERS: dict[str, Completer] = {
     "agents": completer(tuple(AGENTS), several=True),
     "calibrated": completer((), (".json",)),
-    "clone": completer(tuple(AGENTS)),
     "detector": completer(DETECTORS, DETECTOR_SUFFIXES),
     "evaluate_on": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),
     "experiment": completer((), _TABLES),

@@ -90,13 +90,11 @@ def classes_in(spec: Spec, without: Collection[str] = ()) -> list[str]:
     for field in (name for name in type(spec).model_fields if name not in without):
         value = getattr(spec, field)
         for part in value if isinstance(value, tuple) else (value,):
-            named = field in ("clone", "detector", "world")
-            name = part.name if isinstance(part, AgentSpec) else part if named else None
+            is_agent, named = isinstance(part, AgentSpec), field in ("detector", "world")
+            name = part.name if is_agent else part if named else None
             if isinstance(name, str) and not name.lower().endswith(DETECTOR_SUFFIXES):
                 before, colon, _ = name.partition(":")
-                classes += (
-                    [name] if colon and (field in ("detector", "world") or before not in FILE_AGENTS) else []
-                )
+                classes += [name] if colon and not (is_agent and before in FILE_AGENTS) else []
             elif isinstance(part, Spec):
                 classes += classes_in(part)
     return list(dict.fromkeys(classes))

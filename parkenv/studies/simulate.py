@@ -50,9 +50,6 @@ class Observer:
     def on_step(self, step: Step) -> None:
         """Called after each step of the environment."""
 
-    def on_end(self, result: EpisodeResult) -> None:
-        """Called once the episode is over."""
-
 
 class FrameRecorder(Observer):
     """Renders the start of an episode, every n-th step and the last one.
@@ -114,10 +111,7 @@ def simulate(
     if truncated and scenario is not None:
         info = dict(info)
         charge_truncation(info, scenario.give_up_s)
-    result = EpisodeResult(seed, info, truncated, decision_s, memory)
-    for observer in observers:
-        observer.on_end(result)
-    return result
+    return EpisodeResult(seed, info, truncated, decision_s, memory)
 
 
 def charge_truncation(metrics: MutableMapping[str, Any], give_up_s: Any, truncated: Any = 1.0) -> None:

@@ -1,1 +1,1 @@
-"""Reinforcement learning: training environments, algorithms, behaviour cloning."""
+"""Reinforcement learning: specification, configs and trainings."""

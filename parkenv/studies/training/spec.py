@@ -17,7 +17,6 @@ from parkenv.files.spec_file import Several, require_together
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.tables import Column, shared
 from parkenv.studies.fields import (
-    MAX_EPISODES,
     SCENARIOS_TAKE,
     AgentItem,
     Level,
@@ -48,7 +47,6 @@ FILES = "files"  # key of the files of a training in its row
 
 class _Seeds(NamedTuple):
     folder: Path = Path()  # that of the run; a training keeps its checkpoint there
-    shown: Any = None  # demonstrations to clone
     command: tuple[str, ...] = ()  # command line of the run
     columns: Row = {}  # noqa: RUF012 - never changed
 
@@ -92,7 +90,7 @@ class TrainingSpec(Study):
         parkenv train maskable-ppo --scenario campus --steps 4000000 --resume
         parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
         parkenv train maskable-ppo --scenario lots --held-out 0.2 --curriculum size
-        parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
+        parkenv train ppo --test-on street,jam
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
         """
 
@@ -112,15 +110,6 @@ class TrainingSpec(Study):
         "size: start with the smallest tenth of the places, and add larger ones evenly until half of the steps.",
         panel="Learning",
         default="all places from the start",
-    )
-    clone: str | None = option(
-        None,
-        "Start with behaviour cloning of this planner (ppo, maskable-ppo).",
-        takes="AGENT",
-        panel="Learning",
-    )
-    demonstrations: int | None = option(
-        None, "Episodes of the planner to clone.", panel="Learning", default="2000", ge=1, le=MAX_EPISODES
     )
     evaluate_every: int | None = option(
         None,
@@ -177,9 +166,6 @@ class TrainingSpec(Study):
         require_together(
             self.held_out is None or self.evaluate_on is None, "at most one of held_out, evaluate_on"
         )
-        require_together(
-            self.demonstrations is None or self.clone is not None, "demonstrations requires clone"
-        )
         return self
 
     @classmethod
@@ -216,7 +202,7 @@ class TrainingSpec(Study):
         rows = results.rows(self.table).values()
         results.replace([row for row in rows if row["steps"] >= self.steps], self.table)
         seeds = self.cells()[0].items
-        work = _Seeds(results.path, self.training.demonstrations(results.progress), tuple(results.command))
+        work = _Seeds(results.path, tuple(results.command))
         with self.training.watched(results.path, seeds, results.progress):
             yield Stage(self.doing, self, [Cell(work, seeds)])
 
@@ -227,7 +213,7 @@ class TrainingSpec(Study):
         for seed in items:
             folder = work.folder / f"seed_{seed}"
             with own_thread_and_seeds():
-                last = self.training.train(seed, folder, work.shown, work.command)[-1]
+                last = self.training.train(seed, folder, work.command)[-1]
             # As bytes, so that a worker on another machine can return them.
             files = {name: (folder / name).read_bytes() for name in (CURVE, MODEL)}
             rows.append({"seed": seed, "steps": int(last["steps"]), "wall_s": last["wall_s"], FILES: files})

@@ -9,21 +9,17 @@ import time
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
-from parkenv.engine.local_observation import FollowedSearch
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError, require
@@ -35,7 +31,6 @@ from parkenv.scenarios.selection import (
     lot_share,
     open_scenarios,
     require_different_names,
-    seeds_by_scenario,
     split_by_lot,
 )
 from parkenv.show.figures.times import save_learning_curves
@@ -44,21 +39,20 @@ from parkenv.studies.compare.cases import Case, rows_of
 from parkenv.studies.compare.search_replay import search_replay
 from parkenv.studies.fields import AgentSpec, require_agents
 from parkenv.studies.results import Results, Row, fingerprints, flat_tables
-from parkenv.studies.simulate import EpisodeResult, Observer, Step, charge_truncation, simulate
+from parkenv.studies.simulate import charge_truncation
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.study import Progress, ReplayJob, ReportOptions
 from parkenv.studies.training.configs import MAX_STEPS, REWARD_SCALE, SEARCH_CONFIGS, TrainingConfig
 from parkenv.studies.training.curve_file import CURVE, read_curve
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
-from planners.agent import ClairvoyantAgent, make_agent
 from planners.model_file import LearnedAgent, algorithm_class, save_model, slots_observed
 
 if TYPE_CHECKING:
     from parkenv.studies.training.spec import TrainingSpec
 
-# First world seeds of the evaluations during training, of the final test, and of the demonstrations.
-EVALUATION_SEED, TEST_SEED, DEMONSTRATION_SEED = 2_000_000, 3_000_000, 5_000_000
+# First world seeds of the evaluations during training, and of the final test.
+EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
 # World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites.
 TRAINING_SEEDS = 10_000_000
 # Number of evaluations, and decisions between two at most, if the specification does not say.
@@ -133,8 +127,6 @@ class Training:
     def check(self) -> None:
         algorithm_class(self.spec.algorithm)
         learned = self.sides[0]
-        if self.spec.clone is not None:
-            require_cloneable(self.spec.algorithm, self.spec.clone, learned[0])
         require_agents(self.compared, [learned[0], *(places[0] for places in self.tests.values())])
 
     def settings(self) -> Row:
@@ -147,15 +139,6 @@ class Training:
             "scenario": [world.name for world in learned],
             "held_out": [world.name for world in held_out],
         }
-
-    def demonstrations(self, progress: Progress) -> Demonstrations | None:
-        """Record the searches of the planner to clone, if any, which the trainings with all seeds share."""
-        if self.spec.clone is None:
-            return None
-        count = self.spec.demonstrations or 2000
-        progress(f"Recording searches of {self.spec.clone}", 0, count)
-        seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + count)
-        return Demonstrations.collect(self.spec.clone, self.sides[0], seeds, self.spec.k)
 
     @contextmanager
     def watched(self, out: Path, seeds: Sequence[int], progress: Progress) -> Iterator[None]:
@@ -193,9 +176,7 @@ class Training:
         if self.spec.curriculum is not None:
             env.batch.n_scenarios = open_scenarios(len(self.sides[0]), steps / self.spec.steps)
 
-    def train(
-        self, seed: int, folder: Path, shown: Demonstrations | None = None, command: Sequence[str] = ()
-    ) -> list[Row]:
+    def train(self, seed: int, folder: Path, command: Sequence[str] = ()) -> list[Row]:
         """Train with one seed; go on from the folder's checkpoint if there is one, in worlds of its own.
 
         `model.safetensors` is the model with the best evaluation, `curve.csv` lists all evaluations. The checkpoint
@@ -231,8 +212,6 @@ class Training:
             model.set_logger(Logger(None, []))
         if begun is not None:
             restore(begun, model, checkpoint)
-        elif shown is not None:
-            clone(model, shown, seed)
         # stable-baselines3 has seeded the environment with the network's seed.
         env.seed(TRAINING_SEEDS * (seed + 1) + model.num_timesteps)
         curve = [row for row in curve if begun and row["steps"] <= model.num_timesteps]
@@ -257,7 +236,7 @@ class Training:
             "held_out": [place.name for place in held_out],
             "settings": {
                 "n_envs": config.n_envs, "policy": config.policy, **config.settings,
-                "clone": self.spec.clone, "curriculum": self.spec.curriculum,
+                "curriculum": self.spec.curriculum,
             },
         }  # fmt: skip
 
@@ -341,8 +320,6 @@ class Training:
     def _drawn(self, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
         scenarios = f" on {', '.join(s.name for s in self.sides[0])}" if len(self.sides[0]) > 1 else ""
         name = self.spec.algorithm + scenarios
-        if self.spec.clone:
-            name = f"{name} after cloning {self.spec.clone}"
         if not self.holds_out:
             return {name: curves}
         apart = [[row | {"total_s": row["held_out_s"]} for row in curve] for curve in curves]
@@ -520,99 +497,3 @@ def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> 
 
 def _places(scenarios: Sequence[Scenario]) -> str:
     return plural(len(scenarios), "scenario")
-
-
-UPDATES = 3000  # number of optimizer steps: enough for a policy that seldom deviates from the demonstrations
-CLONEABLE = ("ppo", "maskable-ppo")  # algorithms whose policies can be cloned from demonstrations
-BATCH = 512
-LEARNING_RATE = 1e-3
-
-
-def require_cloneable(algorithm: str, agent: str, scenario: Scenario) -> None:
-    require(algorithm in CLONEABLE, f"{algorithm} has no behaviour cloning; take {' or '.join(CLONEABLE)}")
-    require(
-        not isinstance(make_agent(agent, scenario), ClairvoyantAgent),
-        f"{agent} cannot be cloned: it decides on the hidden occupancy, which no policy observes",
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Demonstrations:
-    """Recorded decisions of an agent, for behaviour cloning."""
-
-    agent: str
-    local: NDArray[np.float32]  # (n, 46 + 8k), observations of `LocalObservation`
-    masks: NDArray[np.int8]  # (n, 5), action masks
-    actions: NDArray[np.int64]  # (n,)
-    times: NDArray[np.float64]  # (n,) s from each decision to the end of the search
-
-    @classmethod
-    def collect(
-        cls, agent: str, places: Scenario | Sequence[Scenario], seeds: Sequence[int], k: int = 5
-    ) -> Demonstrations:
-        """Simulate an agent, one search per seed, in a scenario or in the one of several that the seed draws.
-
-        Truncated searches are left out.
-        """
-        places = [places] if isinstance(places, Scenario) else places
-        finished = []
-        for place, its in zip(places, seeds_by_scenario(seeds, len(places)), strict=True):
-            planner = make_agent(agent, place)
-            env = gym.make("parkenv/Search-v2", scenario=place, max_episode_steps=MAX_STEPS)
-            recorder = _DecisionRecorder(FollowedSearch([place], k))
-            for seed in its:
-                simulate(env, planner, seed, (recorder,))
-            finished += recorder.finished
-        if not finished:
-            names = ", ".join(place.name for place in places)
-            raise InputError(f"{agent} finished none of {len(seeds)} searches on {names}: nothing to clone")
-        local, masks, actions, rewards = zip(*itertools.chain.from_iterable(finished), strict=True)
-        lengths = np.cumsum([len(decisions) for decisions in finished])[:-1]
-        times = [-np.cumsum(r[::-1])[::-1] for r in np.split(np.array(rewards), lengths)]
-        return cls(agent, np.stack(local), np.stack(masks), np.array(actions), np.concatenate(times))
-
-
-class _DecisionRecorder(Observer):
-    """Record (local observation, action mask, action, reward) of each decision, for searches that are not truncated."""
-
-    def __init__(self, local: FollowedSearch) -> None:
-        self._local = local
-        self.finished: list[list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]]] = []
-
-    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        self._decisions: list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]] = []
-        self._now = self._local.observe(observation, begins=0)["local"]
-
-    def on_step(self, step: Step) -> None:
-        mask = step.observation["action_mask"]
-        self._decisions.append((self._now, mask, int(step.action), step.reward))
-        self._now = self._local.observe(step.next_observation)["local"]
-
-    def on_end(self, result: EpisodeResult) -> None:
-        if not result.truncated:
-            self.finished.append(self._decisions)
-
-
-def clone(
-    model: OnPolicyAlgorithm, demonstrations: Demonstrations, seed: int, updates: int = UPDATES
-) -> None:
-    """Fit an untrained model's policy to demonstrations, and its value function to the remaining search time."""
-    policy, rng = model.policy, np.random.default_rng(seed)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=LEARNING_RATE)
-    # Copies: a worker process has the arrays in shared memory, which PyTorch must not write.
-    returns = torch.tensor(-REWARD_SCALE * demonstrations.times, dtype=torch.float32)
-    actions = torch.tensor(demonstrations.actions)
-    observed = {
-        "local": torch.tensor(demonstrations.local),
-        "action_mask": torch.tensor(demonstrations.masks),
-    }
-    for _ in range(updates):
-        batch = torch.as_tensor(rng.integers(len(actions), size=BATCH))
-        values, log_prob, _ = policy.evaluate_actions(
-            {name: values[batch] for name, values in observed.items()}, actions[batch]
-        )
-        value_loss = torch.nn.functional.mse_loss(values.flatten(), returns[batch])
-        loss = 0.5 * value_loss - log_prob.mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
