@@ -22,7 +22,7 @@ from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore, Session
-from parkenv.scenarios.selection import by_size, lot_share, open_scenarios, scenario_of_episode, split_by_lot
+from parkenv.scenarios.selection import lot_share, scenario_of_episode, split_by_lot
 from parkenv.scenarios.spec import ScenarioSpec, lot_scenario, scenario_spec, scenario_specs
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.study import schemas
@@ -407,35 +407,13 @@ def test_the_split_is_by_lot_and_stable():
             split_by_lot(PLACES, share)
 
 
-def test_a_curriculum_opens_places_by_size():
-    sizes = [one.lot.n_slots for one in by_size(PLACES)]
-    assert sizes == sorted(sizes)
-    opened = [open_scenarios(50, p) for p in np.linspace(0.0, 1.0, 21)]
-    assert opened[0] == 5
-    assert opened == sorted(opened)
-    assert opened[9] < 50
-    assert opened[10:] == [50] * 11
-    assert open_scenarios(1, 0.0) == open_scenarios(3, 0.0) == 1
-
-
 def test_a_training_evaluates_on_scenarios_it_never_met(tmp_path, monkeypatch):
     make_small(monkeypatch)
-    met = []
-    training = search_training("ppo", 2_048, 1_024, PLACES[:4], PLACES[4:], episodes=12, curriculum="size")
-    before = Training.open_scenarios
-
-    def watched(self, env, steps):
-        before(self, env, steps)
-        met.append((steps, env.batch.n_scenarios))
-
-    monkeypatch.setattr(Training, "open_scenarios", watched)
+    training = search_training("ppo", 2_048, 1_024, PLACES[:4], PLACES[4:], episodes=12)
     curve = training.train(0, tmp_path)
-    assert met == [(steps, open_scenarios(4, steps / 2_048)) for steps in (0, 0, 512, 1024, 1536)]
-    assert [n for _, n in met] == [1, 1, 3, 4, 4]
     card = ModelCard.of_file(tmp_path / "model.safetensors")
     assert card.scenarios == ("lot0", "lot1", "lot2", "lot3")
     assert card.held_out == ("lot4", "lot5")
-    assert card.settings["curriculum"] == "size"
     assert {"total_s", "held_out_s", "held_out_parked_fraction"} < set(curve[-1])
     best = min(curve, key=lambda row: row["total_s"])  # the places trained on decide which model is kept
     assert card.results["held_out_s"] == best["held_out_s"]

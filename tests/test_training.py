@@ -311,7 +311,7 @@ def test_a_checkpoint_that_does_not_fit_or_is_damaged_is_refused_and_runs_nothin
 LOTS = [make_scenario(grid_lot(2, 6 + i), name=f"lot{i}") for i in range(6)]
 TRAININGS = {
     **{name: lambda name=name: search_training(name, 1_500, 400, [SCENARIO]) for name in SEARCH_CONFIGS},
-    "curriculum": lambda: search_training("ppo", 1_536, 512, LOTS, episodes=8, curriculum="size"),
+    "many lots": lambda: search_training("ppo", 1_536, 512, LOTS, episodes=8),
 }
 
 

@@ -1,7 +1,6 @@
 """Which of several scenarios an episode is in, which are kept from training, and scenarios without observations."""
 
 import hashlib
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,8 +12,6 @@ from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 
 BLIND = "-blind"  # suffix of the names of these scenarios
-# A curriculum begins with this share of the scenarios, and has all of them after this share of the training.
-FIRST_SHARE, ALL_AT = 0.1, 0.5
 
 
 def scenario_of_episode(seed: int, episode: int, n: int) -> int:
@@ -60,21 +57,6 @@ def split_by_lot(scenarios: Sequence[Scenario], held_out: float) -> tuple[list[S
                 "name the others with evaluate_on"
             )
     return sides
-
-
-def by_size(scenarios: Sequence[Scenario]) -> list[Scenario]:
-    return sorted(scenarios, key=lambda scenario: (scenario.lot.n_slots, scenario.name))
-
-
-def open_scenarios(n: int, progress: float) -> int:
-    """Return how many of n scenarios a curriculum draws from after a share of the training.
-
-    Examples:
-        >>> [open_scenarios(100, progress) for progress in (0.0, 0.25, 0.5, 1.0)]
-        [10, 55, 100, 100]
-    """
-    share = FIRST_SHARE + (1.0 - FIRST_SHARE) * min(progress / ALL_AT, 1.0)
-    return max(1, math.ceil(round(n * share, 6)))
 
 
 def require_different_names(scenarios: Sequence[Scenario]) -> None:

@@ -89,7 +89,7 @@ class TrainingSpec(Study):
         parkenv train maskable-ppo --scenario campus
         parkenv train maskable-ppo --scenario campus --steps 4000000 --resume
         parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
-        parkenv train maskable-ppo --scenario lots --held-out 0.2 --curriculum size
+        parkenv train maskable-ppo --scenario lots --held-out 0.2
         parkenv train ppo --test-on street,jam
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
         """
@@ -105,12 +105,6 @@ class TrainingSpec(Study):
     seed: Seed = Field(0, description="First seed of the trainings.")
     steps: int = option(2_000_000, "Decisions of a training.", ge=1, le=10**12)
     k: int = option(5, "Slots in an observation.", panel="Learning", ge=1, le=1_000)
-    curriculum: Literal["size"] | None = option(
-        None,
-        "size: start with the smallest tenth of the places, and add larger ones evenly until half of the steps.",
-        panel="Learning",
-        default="all places from the start",
-    )
     evaluate_every: int | None = option(
         None,
         "Decisions between evaluations.",

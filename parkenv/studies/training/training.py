@@ -26,13 +26,7 @@ from parkenv.errors import InputError, require
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import write_csv
 from parkenv.scenarios.build import build
-from parkenv.scenarios.selection import (
-    by_size,
-    lot_share,
-    open_scenarios,
-    require_different_names,
-    split_by_lot,
-)
+from parkenv.scenarios.selection import lot_share, require_different_names, split_by_lot
 from parkenv.show.figures.times import save_learning_curves
 from parkenv.show.tables import plural
 from parkenv.studies.compare.cases import Case, rows_of
@@ -167,14 +161,7 @@ class Training:
         return self.spec.evaluate_every or min(max(1, self.spec.steps // EVALUATIONS), MOST_BETWEEN)
 
     def make_env(self, n_envs: int) -> SearchVecEnv:
-        places = self.sides[0] if self.spec.curriculum is None else by_size(self.sides[0])
-        env = SearchVecEnv(n_envs, places, REWARD_SCALE, self.spec.k, "local", MAX_STEPS)
-        self.open_scenarios(env, 0)
-        return env
-
-    def open_scenarios(self, env: SearchVecEnv, steps: int) -> None:
-        if self.spec.curriculum is not None:
-            env.batch.n_scenarios = open_scenarios(len(self.sides[0]), steps / self.spec.steps)
+        return SearchVecEnv(n_envs, self.sides[0], REWARD_SCALE, self.spec.k, "local", MAX_STEPS)
 
     def train(self, seed: int, folder: Path, command: Sequence[str] = ()) -> list[Row]:
         """Train with one seed; go on from the folder's checkpoint if there is one, in worlds of its own.
@@ -234,10 +221,7 @@ class Training:
         return {
             "scenarios": [place.name for place in learned],
             "held_out": [place.name for place in held_out],
-            "settings": {
-                "n_envs": config.n_envs, "policy": config.policy, **config.settings,
-                "curriculum": self.spec.curriculum,
-            },
+            "settings": {"n_envs": config.n_envs, "policy": config.policy, **config.settings},
         }  # fmt: skip
 
     # Testing
@@ -345,7 +329,6 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         return self.subject.evaluate_every * (1 + steps // self.subject.evaluate_every)
 
     def _on_rollout_start(self) -> None:
-        self.subject.open_scenarios(self.model.env, self.model.num_timesteps)
         # Between rollouts, so that a checkpoint loses no samples.
         if not self.curve or self.num_timesteps >= self._due:
             self._due = self._due_after(self.num_timesteps)
