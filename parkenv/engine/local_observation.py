@@ -68,6 +68,7 @@ from parkenv.engine.search_belief import (
     column_of,
     decay_belief,
     forecast_of,
+    has_cue,
     leaving_rate,
     set_belief_of,
 )
@@ -318,10 +319,10 @@ def _p_occupied(search: Any, column: int) -> float:
 @kernel
 def _announced(search: Any, column: int) -> float:
     """Return P(about to leave) beyond the usual, from numbers rounded as in observations."""
+    if not has_cue(search, column):
+        return 0.0
     cue, k = cue_at(search.cue_table, column), column & (BLOCK_SIZE - 1)
     block = block_at(search.blocks, column >> BLOCK_BITS)
-    if cue.excess == 0.0 or cue.at != block.observed_at[k]:
-        return 0.0
     rate = np.float32(leaving_rate(search, np.float32(block.prior[k]), np.float32(block.decay_rate[k])))
     gap = np.float32(search.time - search.arrival) - np.float32(cue.at - search.arrival)
     return float(np.float32(cue.excess) * math.exp(-rate * gap))

@@ -122,13 +122,20 @@ def belief_now(search: Any, column: int) -> float:
     return float(p if search.cue_table == 0 else p - freed_now(search, column))
 
 
+@inlined
+def has_cue(search: Any, column: int) -> bool:
+    """Return whether a cue belongs to the last observation of a slot: one from before says nothing any more."""
+    cue, block = cue_at(search.cue_table, column), block_at(search.blocks, column >> BLOCK_BITS)
+    return bool(cue.excess != 0.0 and cue.at == block.observed_at[column & (BLOCK_SIZE - 1)])
+
+
 @kernel
 def freed_now(search: Any, column: int) -> float:
-    """Return how much P(free) is above that without cues, if the slot was observed last when its cue was."""
+    """Return how much P(free) is above that without cues."""
+    if not has_cue(search, column):
+        return 0.0
     cue, i = cue_at(search.cue_table, column), column & (BLOCK_SIZE - 1)
     block = block_at(search.blocks, column >> BLOCK_BITS)
-    if cue.excess == 0.0 or cue.at != block.observed_at[i]:
-        return 0.0
     rate = leaving_rate(search, block.prior[i], block.decay_rate[i])
     return float(freed(cue.excess, rate, block.decay_rate[i], search.time - cue.at))
 
@@ -173,7 +180,7 @@ def decay_belief(search: Any) -> None:
             )
     if search.cue_table != 0:
         for column in range(1, search.n_columns + 1):
-            if cue_at(search.cue_table, column).excess != 0.0:
+            if has_cue(search, column):
                 block = block_at(search.blocks, column >> BLOCK_BITS)
                 i = column & (BLOCK_SIZE - 1)
                 block.p_occupied[i] = min(max(block.p_occupied[i] - freed_now(search, column), 0.0), 1.0)
