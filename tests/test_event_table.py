@@ -14,7 +14,7 @@ from parkenv.forecast.counts import Counts
 from parkenv.forecast.event_table import is_counts, read_events
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.counted import log_of_counts
-from parkenv.world.occupancy.gaps import day_states
+from parkenv.world.occupancy.gaps import StateLaw, day_states
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.week import DAY_S, HOUR_S
@@ -99,8 +99,8 @@ def test_gaps_follow_the_law_given_what_is_known_on_both_sides():
         known_until=np.tile([8 * HOUR_S, 11 * HOUR_S], n),
     )  # fmt: skip
     p, kept = 0.3, np.exp(-1.0)
-    law = np.full((n, 48), np.log(p / (1 - p))), np.full(24, 1 / HOUR_S)
-    states = day_states(log, np.arange(n), *law, np.random.default_rng(0))
+    law = StateLaw(np.full((n, 48), np.log(p / (1 - p))), np.full(24, 1 / HOUR_S))
+    states = day_states(log, np.arange(n), law, np.random.default_rng(0))
 
     def share(hour):
         at = [
@@ -114,7 +114,7 @@ def test_gaps_follow_the_law_given_what_is_known_on_both_sides():
     assert share(7.5) == share(10.5) == 1.0
     assert share(9) == pytest.approx(since * stays / (since * stays + (1 - since) * comes), abs=0.035)
     assert share(23) == pytest.approx(p, abs=0.035)
-    again = day_states(log, np.arange(n), *law, np.random.default_rng(0))
+    again = day_states(log, np.arange(n), law, np.random.default_rng(0))
     assert np.array_equal(again.from_s, states.from_s)
 
 

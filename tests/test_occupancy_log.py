@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.occupancy.gaps import day_states
+from parkenv.world.occupancy.gaps import StateLaw, day_states
 from parkenv.world.occupancy.log import OccupancyLog, day_class, weekday_of
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping
@@ -140,8 +140,8 @@ def replay_of(seconds, states):
         ("a",), MONDAYS[:1], np.zeros(len(seconds), int), np.zeros(len(seconds), int), seconds, states
     )
     model = RecordedOccupancy(log, np.zeros(1))
-    law = np.zeros((1, 48)), np.full(24, 1e-3)
-    model._states[0] = day_states(log, np.zeros(1, int), *law, np.random.default_rng(0))
+    law = StateLaw(np.zeros((1, 48)), np.full(24, 1e-3))
+    model._states[0] = day_states(log, np.zeros(1, int), law, np.random.default_rng(0))
     return model.world(0, at(MONDAYS[0], 0))
 
 

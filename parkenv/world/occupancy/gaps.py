@@ -28,13 +28,14 @@ class DayStates(NamedTuple):
     occupied: BoolArray  # (k,)
 
 
-def day_states(
-    log: OccupancyLog,
-    record: IntArray,
-    log_odds: FloatArray,
-    decay_rate: FloatArray,
-    rng: np.random.Generator,
-) -> DayStates:
+class StateLaw(NamedTuple):
+    """The Markov chains of n slots on a day."""
+
+    log_odds: FloatArray  # (n, 48) of P(taken), in the middles of the half-hours
+    decay_rate: FloatArray  # (24,) 1/s, by hour
+
+
+def day_states(log: OccupancyLog, record: IntArray, law: StateLaw, rng: np.random.Generator) -> DayStates:
     """Return the states of slots that replay records of a log.
 
     A state that was seen at a moment holds for `max_gap_s` before and after, unless another one is nearer in time.
@@ -42,8 +43,7 @@ def day_states(
     Args:
         log: the log.
         record: (n,) record of each slot; -1 if it has none.
-        log_odds: (n, 48) of P(taken), in the middles of the half-hours.
-        decay_rate: (24,) 1/s, by hour.
+        law: how states change.
         rng: draws the unknown states.
     """
     n = record.size
@@ -54,7 +54,7 @@ def day_states(
     at = np.arange((high - low).sum()) + np.repeat(low - np.cumsum(high - low) + high - low, high - low)
     state[np.repeat(slot, high - low), at] = np.repeat(taken, high - low)
     unknown_slot, unknown_at = np.nonzero(state < 0)
-    drawn = _drawn(state, log_odds, decay_rate, grid, rng)[unknown_slot, unknown_at]
+    drawn = _drawn(state, law, grid, rng)[unknown_slot, unknown_at]
     slot, from_s = np.append(slot, unknown_slot), np.append(begin, grid[unknown_at])
     taken = np.append(taken, drawn)
     order = np.lexsort((from_s, slot))
@@ -65,11 +65,7 @@ def day_states(
 
 
 def states_between_looks(
-    log: OccupancyLog,
-    record: IntArray,
-    log_odds: FloatArray,
-    decay_rate: FloatArray,
-    rng: np.random.Generator,
+    log: OccupancyLog, record: IntArray, law: StateLaw, rng: np.random.Generator
 ) -> DayStates:
     """As `day_states`, of a log of looks: each holds at its moment alone, and changes come at moments of their own.
 
@@ -81,7 +77,7 @@ def states_between_looks(
     state[slot, np.minimum(np.round(log.second[k] / LOOK_STEP_S).astype(np.int64), grid.size - 1)] = (
         log.occupied[k]
     )
-    taken = _drawn(state, log_odds, decay_rate, grid, rng)
+    taken = _drawn(state, law, grid, rng)
     slot, at = np.nonzero(np.diff(taken, axis=1, prepend=~taken[:, :1]))
     from_s = np.where(at > 0, (at - rng.random(at.size)) * LOOK_STEP_S, 0.0)
     return DayStates(np.searchsorted(slot, np.arange(record.size + 1)), from_s, taken[slot, at])
@@ -111,18 +107,13 @@ def _known(log: OccupancyLog, record: IntArray) -> tuple[IntArray, FloatArray, F
     return slot, begin, end, log.occupied[k]
 
 
-def _drawn(
-    state: NDArray[np.int8],
-    log_odds: FloatArray,
-    decay_rate: FloatArray,
-    grid: FloatArray,
-    rng: np.random.Generator,
-) -> BoolArray:
+def _drawn(state: NDArray[np.int8], law: StateLaw, grid: FloatArray, rng: np.random.Generator) -> BoolArray:
     """Return (n, g) states, the known ones among them (0 or 1; -1: unknown)."""
     period = np.clip(grid / PERIOD_S - 0.5, 0.0, DAY_PERIODS - 1.0)
     low = np.minimum(period.astype(np.int64), DAY_PERIODS - 2)
-    p = expit(log_odds[:, low] + (period - low) * (log_odds[:, low + 1] - log_odds[:, low]))
-    left = np.exp(-decay_rate[(grid // HOUR_S).astype(np.int64)] * (grid[1] - grid[0]))
+    begin, end = law.log_odds[:, low], law.log_odds[:, low + 1]
+    p = expit(begin + (period - low) * (end - begin))
+    left = np.exp(-law.decay_rate[(grid // HOUR_S).astype(np.int64)] * (grid[1] - grid[0]))
     # P(taken one step later), of a slot that is free and of one that is taken.
     if_free, if_taken = (
         np.clip(p[:, 1:] + (now - p[:, :-1]) * left[:-1], _LEAST, 1 - _LEAST) for now in (0.0, 1.0)

@@ -25,7 +25,7 @@ from parkenv.forecast.slot_days import MAX_DAYS, fit_slot_days
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError
 from parkenv.world.occupancy.fit import fit_hourly_decay_rates
-from parkenv.world.occupancy.gaps import DayStates, day_states, states_between_looks
+from parkenv.world.occupancy.gaps import DayStates, StateLaw, day_states, states_between_looks
 from parkenv.world.occupancy.kernel import (
     LOG_KIND,
     MAX_PROBABILITY,
@@ -345,10 +345,10 @@ class RecordedOccupancy(OccupancyModel):
         index = self.log.days.index(day)
         if index not in self._states:
             forecast, rng = self.day_forecast(day), np.random.default_rng(date.fromisoformat(day).toordinal())
-            law = forecast.log_odds, forecast.decay_rate
+            law = StateLaw(forecast.log_odds, forecast.decay_rate)
             drawn = self.changes == "drawn" and not self.log.continuous
             states = states_between_looks if drawn else day_states
-            self._states[index] = states(self.log, self.mapped_log(day).record, *law, rng)
+            self._states[index] = states(self.log, self.mapped_log(day).record, law, rng)
         return self._states[index]
 
     def day_forecast(self, day: str) -> ReplayForecast:
