@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.perception.monocular import GroundView
-from parkenv.perception.pipeline import PerceptionResult
+from parkenv.perception.pipeline import CameraView, PerceptionResult
 from parkenv.world.lot import Mouth, ParkingLot
 
 WEIGHTS = {"picture": -0.26, "red": 1.33, "white": 1.04, "both": 1.72, "moved": 2.98, "person": 0.6}
@@ -27,6 +28,20 @@ _LEAST_PIXELS, _LEAST_BEAMS = 30, 3
 _LIT_PIXELS, _LIT_SHARE = 6, 0.003  # that a lamp has of the end of a car
 _SHOWN = 0.25  # fraction of the end of a car that a picture must show
 _OVERHANG_M, _PERSON_M = 0.4, 0.9
+
+
+class _Picture(NamedTuple):
+    image: NDArray[np.uint8]
+    ground: GroundView
+    at: FloatArray  # (2,) m, the camera in the world
+    ahead: FloatArray  # (2,) direction of its view; likewise to its right
+    aside: FloatArray
+
+    @classmethod
+    def of(cls, view: CameraView, vehicle: FloatArray) -> Self:
+        x, y, yaw = view.mount.in_world(vehicle)
+        ahead, aside = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])
+        return cls(view.image, GroundView(view.camera, view.mount), np.array([x, y]), ahead, aside)
 
 
 class DepartureCues:
@@ -48,13 +63,14 @@ class DepartureCues:
     def features(self, newest: Sequence[PerceptionResult], slots: IntArray) -> FloatArray:
         """Return the features of cars in slots, (k, n) as in `WEIGHTS`, from one or two captures, oldest first."""
         scans = [_points(result) for result in newest]
+        # What the newest capture does not show, the one before may.
+        pictures = [_Picture.of(view, result.vehicle) for result in newest[::-1] for view in result.views]
         rows = np.zeros((len(slots), len(WEIGHTS)))
         for row, slot in zip(rows, slots.tolist(), strict=True):
             outs = [self._outline(points, slot) for points in scans]
             out, person = outs[-1]
-            for result in newest:
-                light = self._lights(result, slot, 0.0 if math.isnan(out) else out)
-                row[:4] = row[:4] if light is None else (1.0, *light, min(light))
+            if light := self._lights(pictures, slot, 0.0 if math.isnan(out) else out):
+                row[:4] = 1.0, *light, min(light)
             if out > _OVERHANG_M:
                 row[4] = np.clip(np.nan_to_num(out - outs[0][0]), 0.0, 1.0)
             row[5] = person
@@ -73,31 +89,28 @@ class DepartureCues:
         car = ahead[(near < wide - 0.2) & (ahead > -deep) & (ahead < (_OVERHANG_M if passes else deep))]
         return (float(np.sort(car)[-_LEAST_BEAMS]) if len(car) >= _LEAST_BEAMS else math.nan), bool(person)
 
-    def _lights(self, result: PerceptionResult, slot: int, end: float) -> list[float] | None:
-        """Return how bright red and white light is at the outer end of a car, 0 to 1; None without a picture of it.
+    def _lights(self, pictures: Sequence[_Picture], slot: int, end: float) -> list[float]:
+        """Return how bright red and white light is at the outer end of a car, 0 to 1; nothing without a picture of it.
 
         At kerbs, walls and paint beside the car look like lamps as often as lamps do.
         """
         out = self._out[slot]
         if self._at_kerb[slot]:
-            return None
+            return []
         corner = np.array([(a, side) for a in (end - 0.8, end + 0.2) for side in (-0.8, 0.8)])
         xy = (
             self._mouth[slot]
             + corner[:, :1] * out
             + corner[:, 1:] * self._half_width[slot] * self._side[slot]
         )
-        for view in result.views:
-            x, y, yaw = view.mount.in_world(result.vehicle)
-            heading = np.array([math.cos(yaw), math.sin(yaw)])
-            forward, right = (xy - [x, y]) @ heading, (xy - [x, y]) @ [heading[1], -heading[0]]
-            if forward.min() > 0.5 and ([x, y] - self._mouth[slot]) @ out > 0.0:
-                ground = GroundView(view.camera, view.mount)
+        for image, ground, at, ahead, aside in pictures:
+            forward, right = (xy - at) @ ahead, (xy - at) @ aside
+            if forward.min() > 0.5 and (at - self._mouth[slot]) @ out > 0.0:
                 corners = [ground.pixels(forward, right, np.full(4, z)) for z in _LAMPS_M]
-                pixels = _within(view.image, np.concatenate(corners))
+                pixels = _within(image, np.concatenate(corners))
                 if len(pixels) >= _LEAST_PIXELS:
                     return _brightness(pixels)
-        return None
+        return []
 
 
 def log_likelihood_ratio(features: FloatArray) -> FloatArray:
