@@ -176,13 +176,11 @@ def image(suffix):
     return cv2.imencode(suffix, _PIXELS[..., 0] if suffix == ".pgm" else _PIXELS)[1].tobytes()
 
 
-SLOTS = "".join(f"s{i}{j},{2.5 * i},{j},{0.3 * j - 1.57}\n" for i in range(9) for j in (0, 11))
 FORMATS = {
     "lot.geojson": Format(json.loads((ROOT / "lots/packaged/mini.geojson").read_text()), mutated_json, lot),
     "map.yml": Format(MAP, mutated_text, lot),
     "osm.osm": Format(car_park().xml(), mutated_text, imported),
     "turbo.geojson": Format(json.loads(car_park().geojson()), mutated_json, imported),
-    "slots.csv": Format("id,x,y,yaw\n" + SLOTS, mutated_text, imported),
     "log.csv": Format(LOG, mutated_text, OccupancyLog.read),
     "log.csv.gz": Format(LOG.encode(), mutated_bytes, OccupancyLog.read),
     "process.json": Format(PROCESS, mutated_json, OccupancyProcess.from_file),
@@ -270,7 +268,6 @@ READERS = {
     "scenario.toml": make_scenario,
     "experiment.toml": lambda path: read_study(path).check(),
     "counts.csv": Counts.read,
-    "slots.csv": import_lot,
     "map.yml": read_lot,
     "file.json": read_json,
     "file.toml": read_toml,
@@ -290,5 +287,5 @@ def test_bad_files_are_refused_in_a_line_with_what_was_wanted(tmp_path, name, te
     assert line.startswith(f"{path}: ") or name == "experiment.toml"
     assert len(line) < 500
     assert re.search(".*".join(map(re.escape, said.split(" … "))), line)
-    if name in ("slots.csv", "map.yml"):
+    if name == "map.yml":
         assert "error" in {problem.severity for problem in check_lot(path)}

@@ -157,6 +157,15 @@ class TestGuesses:
             guess.startswith("entry") for guess in imported(tmp_path, double_row(), options).guesses
         )
 
+    @pytest.mark.parametrize(
+        "rows", [[row((0.0, 0.0), 0.0, 8)], [row((0.0, y), 0.0, 8) for y in (0.0, 11.0, 22.0)]]
+    )
+    def test_rows_that_could_open_to_either_side_are_guessed_and_said(self, tmp_path, rows):
+        draft = imported(tmp_path, rows)
+        assert draft.lot().n_slots == sum(map(len, rows))
+        assert "1 could open to either side" in " ".join(draft.guesses)
+        assert draft.issues[0].reason == "rows could open to either side"
+
     def test_the_file_keeps_guesses_and_issues(self, tmp_path):
         draft = imported(tmp_path, double_row())
         path = tmp_path / "lot.geojson"

@@ -57,8 +57,7 @@ LotName = Annotated[
 Place = Annotated[
     Path,
     Field(
-        description="OpenStreetMap (.osm, .osm.pbf, overpass-turbo .geojson), slot centres (.csv), a "
-        "Dragon Lake map (.yml) or a lot."
+        description="OpenStreetMap (.osm, .osm.pbf, overpass-turbo .geojson), a Dragon Lake map (.yml) or a lot."
     ),
     Option(takes="FILE", argument=True),
 ]
@@ -180,7 +179,6 @@ class Import(Command):
     soft_wrap: ClassVar = True
     examples = """
         parkenv lot import map.osm --out lot.geojson --picture lot.png
-        parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25
         parkenv lot import spaces.geojson --entry auto --goal auto --out lot.geojson
         parkenv lot import town.geojson --split --out lots
         parkenv lot import town.osm.pbf --town --out town.geojson --picture town.png

@@ -100,7 +100,7 @@ class ImportOptions:
                 if len(point) != 2 or not np.isfinite(point).all():
                     raise InputError(f"{what} is {point!r}, want two finite numbers")
 
-    def box(self, frame: LocalFrame | None) -> tuple[float, float, float, float] | None:
+    def box(self, frame: LocalFrame) -> tuple[float, float, float, float] | None:
         if self.bounds is None:
             return None
         corners = points_in_frame(frame, self.bounds)

@@ -29,7 +29,6 @@ from parkenv.world.lot import Lane, ParkingLot
 FORMATS = {
     **dict.fromkeys((".yml", ".yaml"), "dragon-lake"),
     **dict.fromkeys((".osm", ".xml", ".pbf"), "osm"),
-    ".csv": "slots",
 }
 WHOLE = (
     "native",
@@ -110,8 +109,7 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
     """Draft a lot from a file of a real place.
 
     Supported formats are OpenStreetMap (`.osm`, `.xml`, also packed as `.gz` and `.bz2`, `.osm.pbf`,
-    overpass-turbo GeoJSON; see `parkenv.lots.osm.draft`), lists of slot centres (`.csv`; see
-    `parkenv.lots.formats.slot_list`), the Dragon Lake map and native lots.
+    overpass-turbo GeoJSON; see `parkenv.lots.osm.draft`), the Dragon Lake map and native lots.
     Latitudes and longitudes are projected to metres east and north of the file's centre.
 
     Args:
@@ -132,19 +130,12 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
         from parkenv.lots.osm.draft import osm_draft
 
         return osm_draft(path, options)
-    if file_format == "slots":
-        from parkenv.lots.formats.slot_list import slot_list_draft
-
-        return slot_list_draft(path, options)
     require(
         file_format,
-        f"{path}: unknown kind of file {path.suffix!r}, want .osm, .xml or .pbf (OpenStreetMap), "
-        ".json or .geojson (overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml",
+        f"{path}: unknown kind of file {path.suffix!r}, want .osm, .xml or .pbf (OpenStreetMap), .json or .geojson "
+        "(overpass-turbo, a native lot) or a Dragon Lake .yml; for slot centres, see examples/02_your_own_lot.py",
     )
-    require(
-        options.bounds is None,
-        f"{path}: bounds apply to OpenStreetMap and lists of slots; this file is a whole lot",
-    )
+    require(options.bounds is None, f"{path}: bounds apply to OpenStreetMap; this file is a whole lot")
     lot, recognised = _read_whole(path)
     draft = LotDraft.of_lot(lot)
     if recognised:
@@ -254,8 +245,7 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     lanes that cross or nearly touch without a common point; slots that overlap, face away from their lane, cannot be
     reached from an entry or do not lead to another slot; entries that do not lead to a slot; dead ends.
 
-    For OpenStreetMap files and lists of slots, errors state what a search still needs, and warnings what an import
-    leaves out.
+    For OpenStreetMap files, errors state what a search still needs, and warnings what an import leaves out.
     """
     path = Path(path)
     file_format = lot_format(path)

@@ -1,1 +1,1 @@
-"""Files of lots: native GeoJSON, the Dragon Lake map, lists of slot centres."""
+"""Files of lots: native GeoJSON and what is in it."""

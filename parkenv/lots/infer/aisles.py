@@ -22,7 +22,6 @@ LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.7, 3.9
 # Fraction of that width that is enough before single spaces of an oblique and of a perpendicular row.
 TOLERATED, TOLERATED_ACROSS = 0.75, 0.95
 EXHAUSTIVE = 14  # undecided rows up to which all combinations of sides are tried
-PREFERRED = 0.3  # gain per space of a row that opens to the side that its spaces prefer
 ON_ROAD = 4.0  # gain per space of a row that opens to a road of the map
 # Costs per space of a row that opens to free ground, of a gap as wide as an aisle that nothing opens to, and the gain
 # per space of two rows that share an aisle.
@@ -64,8 +63,7 @@ def open_rows(
     lost: list[int] = []
     for row in rows:
         views = [_view(spaces, shapes, tree, row, side) for side in (0, 1)]
-        wanted = np.stack([_agreement(spaces, row, side) for side in (0, 1)], axis=1)
-        is_open = np.stack([_is_open(view.clear, row) for view in views], axis=1) & (wanted > -0.7)
+        is_open = np.stack([_is_open(view.clear, row) for view in views], axis=1)
         if len(row) == 1 and not is_open.any():
             lost += row.members.tolist()
             continue
@@ -135,13 +133,6 @@ def _is_open(clear: FloatArray, row: Row) -> BoolArray:
     return clear >= (tolerated * need if np.median(clear) >= need else need)
 
 
-def _agreement(spaces: Spaces, row: Row, side: int) -> FloatArray:
-    """How well a side agrees with the known open sides of spaces, (k,): 1, -1, half of these, or 0 if none is known."""
-    if spaces.opens is None:
-        return np.zeros(len(row))
-    return np.asarray((spaces.opens[row.members] * row.outward(side)).sum(axis=1))
-
-
 def _choose(
     spaces: Spaces, parts: Sequence[tuple[Row, list[View]]], roads: Sequence[FloatArray]
 ) -> tuple[list[int], list[float]]:
@@ -155,10 +146,7 @@ def _choose(
     for r, (row, views) in enumerate(parts):
         need = least_aisle(row)
         for side, view in enumerate(views):
-            wanted = _agreement(spaces, row, side)
-            shut = ~_is_open(view.clear, row) | (wanted < -0.7)
-            unary[r, side] -= PREFERRED * float(wanted.sum())
-            if shut.any():
+            if not _is_open(view.clear, row).all():
                 unary[r, side] += np.inf
                 continue
             # How much a gap is like an aisle: most from 5 to 7.5 m.
