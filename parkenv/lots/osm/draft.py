@@ -441,7 +441,6 @@ def refuse_far_away(elements: Sequence[OsmElement]) -> None:
 
 
 MOST_SPACES = 20_000  # maximum number of spaces of one lot
-LARGEST_USUAL = 18.0  # area, m², that few parking spaces for cars exceed
 
 
 def outline_draft(
@@ -506,16 +505,11 @@ def outline_draft(
 
 
 def _refuse_swapped(areas: Sequence[Area]) -> None:
-    """Raise an error if the spaces have the size of parked cars only with latitude and longitude exchanged."""
-    if not areas:
-        return
+    """Raise an error if many more spaces have the size of parked cars with latitude and longitude exchanged."""
     lonlat = [area.element.lines[0] for area in areas]
-    if np.abs(np.concatenate(lonlat)).max() > 89.0:
+    if not areas or np.abs(np.concatenate(lonlat)).max() > 89.0:
         return
-    (size, skew), (other_size, other_skew) = (
-        _plausibility(positions) for positions in (lonlat, [line[:, ::-1] for line in lonlat])
-    )
-    if (size < 0.3 and other_size > 0.6) or (skew > 0.12 and other_skew < 0.06 and other_size > 0.6):
+    if _like_cars([line[:, ::-1] for line in lonlat]) - _like_cars(lonlat) > 0.3:
         lon, lat = lonlat[0][0].tolist()
         raise InputError(
             f"{areas[0].element.id} is at {lat:.4f}, {lon:.4f}, where few spaces have the size of a car, want "
@@ -523,16 +517,13 @@ def _refuse_swapped(areas: Sequence[Area]) -> None:
         )
 
 
-def _plausibility(outlines: Sequence[FloatArray]) -> tuple[float, float]:
-    """Return the fraction of outlines, (k, 2) degrees, of a car's size, and their median skew: 0 for rectangles."""
+def _like_cars(outlines: Sequence[FloatArray]) -> float:
+    """Return the fraction of outlines, (k, 2) degrees, that have the size of a parked car."""
     frame = LocalFrame.around(np.concatenate(outlines))
     polygons = [p for o in outlines if (p := shapely.Polygon(frame.to_xy(o))).area >= 0.1]
     sizes = [np.hypot(*np.diff(rectangle_corners(p)[:3], axis=0).T) for p in polygons]
-    fits = [1.8 < s.min() < 3.3 and 4.0 < s.max() < 6.4 and s.prod() < LARGEST_USUAL for s in sizes]
-    simple = [shapely.get_coordinates(shapely.simplify(p, 0.2)) for p in polygons]
-    sides = [np.diff(corners[:3], axis=0) for corners in simple if len(corners) == 5]
-    skew = [abs(float(a @ b)) / float(np.hypot(*a) * np.hypot(*b)) for a, b in sides]
-    return float(np.mean(fits)) if fits else 0.0, float(np.median(skew)) if skew else 0.0
+    fits = [1.8 < s.min() < 3.0 and 4.0 < s.max() < 6.0 and s.prod() < 16.0 for s in sizes]
+    return float(np.mean(fits)) if fits else 0.0
 
 
 # Distance, m, between spaces up to which they belong to one car park: a street with verges, or two aisles.
