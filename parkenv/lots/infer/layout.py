@@ -175,15 +175,12 @@ def draft_inferred_lot(
     options: ImportOptions,
     *,
     source: str,
-    unit: str,
     left_out: Mapping[str, Sequence[str]],
-    frame: LocalFrame | None,
+    frame: LocalFrame,
     goals: FloatArray,
-    goal_note: str = "",
-    walls: Sequence[FloatArray] = (),
-    outlines: Sequence[FloatArray] = (),
+    goal_note: str,
 ) -> LotDraft:
-    """Draft an inferred lot; `unit` is what a space is in the file, such as "outlines"; `left_out` are others."""
+    """Draft an inferred lot; `source` is that of its slots, `left_out` are other spaces of the file."""
     without_aisle = {reason: [spaces.ids[i] for i in members] for reason, members in lot.left_out.items()}
     lost = sum(map(len, without_aisle.values()))
     if lost > MOST_LOST * len(spaces):
@@ -194,7 +191,7 @@ def draft_inferred_lot(
     is_known = bool(options.entries) or options.guess_entry or lot.entry is None
     entries = lot.entries if is_known else lot.entries[:0]
     unused = sum(map(len, left_out.values()))
-    guesses, issues = _guesses_and_issues(lot, len(spaces), unused, unit, options, goal_note)
+    guesses, issues = _guesses_and_issues(lot, len(spaces), unused, options, goal_note)
     return LotDraft(
         name=name,
         slot_ids=tuple(spaces.ids[i] for i in lot.index),
@@ -203,9 +200,7 @@ def draft_inferred_lot(
         lanes=lot.lanes,
         entries=entries,
         goals=goals,
-        walls=tuple(walls),
-        outlines=tuple(outlines),
-        found=tuple(_found(lot, len(spaces), unit, frame)),
+        found=tuple(_found(lot, len(spaces), frame)),
         guesses=tuple(guesses),
         issues=tuple(issues),
         left_out=LeftOut.by_reason({**left_out, **without_aisle}),
@@ -214,21 +209,20 @@ def draft_inferred_lot(
     ).searchable()
 
 
-def _found(lot: InferredLot, n: int, unit: str, frame: LocalFrame | None) -> Iterator[str]:
+def _found(lot: InferredLot, n: int, frame: LocalFrame) -> Iterator[str]:
     rows = lot.rows
     slants = np.digitize(np.degrees([part.row.slant for part in rows]), (15.0, 75.0)).tolist()
     kinds = enumerate(("kerbside", "oblique", "perpendicular"))
     listed = ", ".join(f"{slants.count(k)} {kind}" for k, kind in kinds if k in slants)
-    yield f"slots: {len(lot.index)} of {n} {unit}, in rows ({len(rows)}): {listed}"
+    yield f"slots: {len(lot.index)} of {n} outlines, in rows ({len(rows)}): {listed}"
     wide = [aisle.width for aisle in lot.aisles if aisle.width < 2 * SLOT_REACH]
     width = f", {min(wide):.1f} to {max(wide):.1f} m wide" if wide else ""
     yield f"aisles: {len(lot.aisles)}{width}; connections: {len(lot.connections)}; lanes: {len(lot.lanes)}"
-    if frame is not None:
-        yield f"frame: {frame}"
+    yield f"frame: {frame}"
 
 
 def _guesses_and_issues(
-    lot: InferredLot, n: int, unused: int, unit: str, options: ImportOptions, goal_note: str
+    lot: InferredLot, n: int, unused: int, options: ImportOptions, goal_note: str
 ) -> tuple[list[str], list[QualityIssue]]:
     """Return a sentence for each guess, and what may be wrong; `unused` spaces beside the n were not inferred from."""
     unsure = [part for part in lot.rows if part.certainty < SHARE_UNSURE]
@@ -266,7 +260,7 @@ def _guesses_and_issues(
     )
     issues: tuple[tuple[float, str, float], ...] = (
         (doubt, "rows could open to either side", min(0.6, 0.6 * doubt / n + 0.02)),
-        (lost, f"{unit} left out", min(0.5, 1.5 * lost / (n + unused))),
+        (lost, "outlines left out", min(0.5, 1.5 * lost / (n + unused))),
         (far, "long connections through unknown ground", min(0.4, 0.002 * far + 0.05)),
         (narrow, "narrow connections", min(0.3, 0.05 * narrow)),
         (two_way, "oblique rows on two-way aisles", 0.15),

@@ -488,19 +488,21 @@ def outline_draft(
     goal_note: str | None = None
     if not len(goals):
         goals, goal_note = find_goals(lot.slots, [e for e in elements if e.is_node], buildings, frame)
-    return draft_inferred_lot(
+    draft = draft_inferred_lot(
         name,
         lot,
         spaces,
         options,
         source=MAPPED,
-        unit="outlines",
         left_out=left_out,
         frame=frame,
         goals=goals,
         goal_note=goal_note or "",
-        walls=exterior_rings(a.polygon for a in buildings),
-        outlines=exterior_rings(a.polygon for a in parking),
+    )
+    return replace(
+        draft,
+        walls=tuple(exterior_rings(a.polygon for a in buildings)),
+        outlines=tuple(exterior_rings(a.polygon for a in parking)),
     )
 
 
