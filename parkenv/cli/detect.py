@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -202,13 +202,11 @@ class TrainDetector(Command):
         window = END if self.front else SIDE
         with self.console.status("Training") as status:
             data, photos = self._photographs()
-            aligned: dict[str, Any] = (
-                {} if self.labels is None else {"region_aspect": window.aspect, "car": window.car}
-            )
             model = train(
                 data.positives,
                 data.negatives,
                 photos=photos,
+                window=None if self.labels is None else window,
                 descriptor=Descriptor(*window.size, self.normalization),
                 end_on=self.front,
                 settings=TrainingSettings(
@@ -217,7 +215,6 @@ class TrainDetector(Command):
                 trained_on=f"{len(data.positives)} crops and {len(data.negatives)} others in "
                 f"{self.uiuc or self.crops or self.labels}",
                 progress=status.update,
-                **aligned,
             )
             model.save(self.out)
         self.say(f"Trained on {model.trained_on}. Written: {self.out}")

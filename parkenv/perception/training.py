@@ -12,7 +12,7 @@ from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.detector import overlaps
 from parkenv.perception.hog import Descriptor
-from parkenv.perception.hog_detector import HogDetector, best_boxes
+from parkenv.perception.hog_detector import CarWindow, HogDetector, best_boxes
 
 CAR_OVERLAP = 0.25
 _LEAST = 20
@@ -46,8 +46,7 @@ def train(
     *,
     photos: Sequence[LabelledImage] = (),
     descriptor: Descriptor | None = None,
-    region_aspect: float | None = None,
-    car: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0),
+    window: CarWindow | None = None,
     end_on: bool = False,
     settings: TrainingSettings | None = None,
     trained_on: str = "",
@@ -61,9 +60,9 @@ def train(
     model that has only seen whole cars finds small ones in the parts of a large one. Probabilities are calibrated on
     cross-validated scores (Platt 1999).
 
-    Crops are grey, uint8; positives, at least 20, are aligned, with the `car` at these fractions of their left, top,
-    right and bottom, and resized to the window. False positives beside and within the labelled cars of `photos` are
-    mined, too.
+    Crops are grey, uint8; positives, at least 20, are aligned, with the car where it stands in the `window` (without
+    one, it fills them), and resized to that of the descriptor. False positives beside and within the labelled cars of
+    `photos` are mined, too.
     """
     if len(positives) < _LEAST or not negatives:
         raise InputError(
@@ -71,7 +70,8 @@ def train(
         )
     settings = settings or TrainingSettings()
     descriptor = descriptor or Descriptor()
-    aspect = region_aspect or positives[0].shape[1] / positives[0].shape[0]
+    height, width = positives[0].shape
+    car, aspect = ((0.0, 0.0, 1.0, 1.0), width / height) if window is None else (window.car, window.aspect)
     rng = np.random.default_rng(settings.seed)
     size = (descriptor.width, descriptor.height)
 
