@@ -274,7 +274,7 @@ READERS = {
     "file.yml": read_yaml,
     "track.gpx": read_track,
     "poses.csv": read_track,
-    **dict.fromkeys(("scene.csv", "scene.json", "scene.toml", "scene.geojson"), read_scene),
+    **dict.fromkeys(("scene.csv", "scene.json", "scene.toml"), read_scene),
 }
 
 

@@ -66,24 +66,15 @@ def own_text(**changes):
     return "\n".join([*lines, f"[[obstacles]]\nline = {json.dumps(KERB)}"])
 
 
-def geojson_content():
-    def feature(kind, shape, at, **more):
-        geometry = {"type": shape, "coordinates": at}
-        return {"type": "Feature", "properties": {"kind": kind} | more, "geometry": geometry}
-
-    features = [feature(k, "Point", p[:2], yaw=p[2]) for k, p in (("start", START), ("target", TARGET))]
-    features += [feature("obstacle", "Polygon", [[*block, block[0]]]) for block in BLOCKS]
-    features.append(feature("obstacle", "LineString", KERB))
-    return {"type": "FeatureCollection", "vehicle": "tpcap", "features": features}
-
-
 def test_every_format_says_the_same_scene_wherever_it_lies(tmp_path):
     far = np.array([4.0e9, -2.5e8])
     moved = [(*(np.array(pose[:2]) + far), pose[2]) for pose in (START, TARGET)]
     (tmp_path / "a1.csv").write_text(tpcap_text(START, TARGET, BLOCKS))
     (tmp_path / "a2.csv").write_text(tpcap_text(*moved, np.array(BLOCKS) + far).replace(",", "\n"))
     (tmp_path / "a3.toml").write_text(own_text())
-    (tmp_path / "a10.geojson").write_text(json.dumps(geojson_content()))
+    own = {"start": START, "target": TARGET, "vehicle": "tpcap"}
+    obstacles = [*({"polygon": block} for block in BLOCKS), {"line": KERB}]
+    (tmp_path / "a10.json").write_text(json.dumps(own | {"obstacles": obstacles}))
     scenes = [read_scene(file) for file in scene_files(tmp_path)]
     assert [scene.name for scene in scenes] == ["a1", "a2", "a3", "a10"]
     for scene in scenes:

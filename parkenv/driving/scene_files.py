@@ -1,4 +1,4 @@
-"""Read scenes of manoeuvres from files: TPCAP's CSV, ParkBench's JSON, and our own TOML, JSON and GeoJSON.
+"""Read scenes of manoeuvres from files: TPCAP's CSV, ParkBench's JSON, and our own TOML and JSON.
 
 Files are recognised by their content. Coordinates of a scene are relative to its start, see `Scene.origin`.
 """
@@ -21,7 +21,7 @@ from parkenv.files.limited_reading import is_there, parse_json, read_text, read_
 from parkenv.files.spec_file import Several, Spec, read_tables
 
 # Suffixes of the files that are read in a folder of scenes.
-SCENE_SUFFIXES = (".csv", ".json", ".toml", ".geojson")
+SCENE_SUFFIXES = (".csv", ".json", ".toml")
 PARKBENCH_STEP_M = 0.1  # distance of the points into which ParkBench divides its lines
 
 
@@ -113,7 +113,7 @@ def read_scene(path: str | Path, vehicle: VehicleParameters | None = None) -> Sc
         content = parse_json(text, str(path), finite=True)
         if "Frames" in content:
             return _parkbench(content, path.stem, vehicle)
-        return _own(_of_geojson(content) if "features" in content else content, path, vehicle)
+        return _own(content, path, vehicle)
 
 
 def _scene(
@@ -141,7 +141,7 @@ def _tpcap(text: str, name: str, vehicle: VehicleParameters | None) -> Scene:
         values = np.array([float(word) for word in words])
     except ValueError:
         raise InputError(
-            "is no scene: want numbers as TPCAP's CSV has them, ParkBench's JSON, or our TOML, JSON or GeoJSON"
+            "is no scene: want numbers as TPCAP's CSV has them, ParkBench's JSON, or our TOML or JSON"
         ) from None
     if not np.isfinite(values).all():
         raise InputError(f"number {int(np.argmin(np.isfinite(values))) + 1} is not finite")
@@ -206,31 +206,6 @@ def _own(content: Mapping[str, Any], path: Path, vehicle: VehicleParameters | No
         start, end = (tuple((np.array(point) - scene.origin).tolist()) for point in user.way)
         crossings.append(dataclasses.replace(crossing, way=(start, end)))
     return dataclasses.replace(scene, crossings=tuple(crossings))
-
-
-def _of_geojson(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tables of a GeoJSON file: points of the kinds start and target with a yaw; polygons and lines."""
-    tables: dict[str, Any] = {name: content[name] for name in ("vehicle", "bounds") if name in content}
-    obstacles: list[dict[str, Any]] = []
-    if not isinstance(content["features"], list):
-        raise InputError(f"features is {content['features']!r:.60}, want a list")
-    for i, feature in enumerate(content["features"]):
-        try:
-            kind = (feature.get("properties") or {}).get("kind", "obstacle")
-            shape, at = feature["geometry"]["type"], feature["geometry"]["coordinates"]
-            if kind in ("start", "target"):
-                tables[kind] = [*at[:2], feature["properties"]["yaw"]]
-            elif shape == "LineString":
-                obstacles.append({"line": [point[:2] for point in at]})
-            elif shape == "Polygon" and len(at) == 1:
-                obstacles.append({"polygon": [point[:2] for point in at[0]]})
-            else:
-                raise InputError(
-                    f"features.{i} is a {shape!r:.40}, want a Polygon without holes or a LineString"
-                )
-        except (AttributeError, IndexError, KeyError, TypeError) as error:
-            raise InputError(f"features.{i} is no part of a scene: {type(error).__name__} {error}") from error
-    return tables | {"obstacles": obstacles}
 
 
 def _opened(points: FloatArray) -> FloatArray:

@@ -98,7 +98,7 @@ class ManoeuvreStudy(Study):
     kind: Literal["park"] = "park"
     cases: Annotated[Path | None, BeforeValidator(_there)] = option(
         None,
-        "A scene, or a folder of scenes: TPCAP's CSV, ParkBench's JSON, or our own (.toml, .json, .geojson).",
+        "A scene, or a folder of scenes: TPCAP's CSV, ParkBench's JSON, or our own (.toml, .json).",
         takes="DIR|FILE",
         default="none",
         panel="Scenes",
