@@ -23,8 +23,9 @@ from typing import Any
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, naming, require, with_extra
 from parkenv.files.file_names import is_plain
 from parkenv.lots.bays.kerbs import kerb_slots_of
@@ -33,7 +34,7 @@ from parkenv.lots.bays.rules import rules_text, tags_of
 from parkenv.lots.draft import UNREACHED, LeftOut, LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots, nearest_on_lanes
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.conditions import RESERVED_PLACES, closed_parking, note_other_keys
+from parkenv.lots.osm.conditions import closed_parking, note_other_keys
 from parkenv.lots.osm.draft import (
     MAPPED_OVERLAP,
     NO_AISLE,
@@ -56,7 +57,7 @@ from parkenv.lots.osm.parking import (
 from parkenv.lots.osm.roads import Rank, Road, Turns, count_in, off_the_ground, turns_of
 from parkenv.lots.town import supply
 from parkenv.lots.town.streets import BEYOND, read_streets
-from parkenv.lots.unread import Unread, note_unread, noting_unread, unread_rows
+from parkenv.lots.unread import Unread, noting_unread, unread_rows
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_KINDS, FACILITY_REACH
 from parkenv.world.lot import Lane
@@ -71,6 +72,7 @@ SAME_TAGS = ("name", "ref", "parking")  # tags in which a car park and a node in
 PAID: dict[str, Any] = {"per_hour": supply.PRICE, "assumed": True}
 NO_ENTRY = "no entry: no street crosses the edge of the map"
 TOO_FAR = f"parking farther than {FACILITY_REACH:g} m from every street"
+NOT_ON_MAP = "car parks of the list that the map lacks, without a street or a capacity"
 NO_GOAL = "no goal: no building and no point of interest in it; export buildings and shops, too"
 ALONG_STREETS = "goals along the streets, as there is no building and no point of interest; export these, too"
 UNUSED = ("construction", "disused", "abandoned")  # values of `parking` that no car may use
@@ -208,12 +210,7 @@ class _TownImport(MapImport):
         if not parts:
             return
         polygons = np.array([part.polygon for part in parts], dtype=np.object_)
-        near = shapely.STRtree(polygons).query(polygons, predicate="dwithin", distance=SAME_CAR_PARK)
-        owner = len(self.parking) + component_labels(near.T, len(polygons))
-        if self.parking:
-            tree = shapely.STRtree([a.polygon for a in self.parking])
-            space, park = tree.query(shapely.point_on_surface(polygons), predicate="intersects")
-            owner[space[::-1]] = park[::-1]
+        owner = _car_parks_of(polygons, self.parking)
         groups: dict[int, tuple[list[Slots], list[supply.Rules]]] = defaultdict(lambda: ([], []))
         for _, index, slots in by_rank:
             for k in np.unique(owner[index]).tolist():
@@ -296,15 +293,7 @@ class _TownImport(MapImport):
             raise InputError(f"no bay stands at a street of the map ({why}); {advice}")
         self.n_bays = len(kerbs.ids) + sum(len(left.ids) for left in self.bays_left_out)
         self.bays_found = register.found
-        rules: dict[tuple[Rule, ...], supply.Rules] = {}
-        for own, count in Counter(register.rules[kerbs.bay].tolist()).items():
-            tags, notes = tags_of(own)
-            with noting_unread() as unread:
-                rules[own] = supply.rules_of(tags)
-            for part, text, assumed in notes:
-                self.unread[part, text, assumed] += count
-            for note in unread_rows(unread):
-                self.unread[note.tag.removesuffix(":conditional"), rules_text(own), note.assumed] += count
+        rules, self.unread = _rules_of_bays(register.rules[kerbs.bay].tolist())
         rows: dict[tuple[str, str], list[int]] = defaultdict(list)
         for i, (k, is_left) in enumerate(zip(kerbs.road.tolist(), kerbs.is_left.tolist(), strict=True)):
             side = roads[k].side_of_way("left" if is_left else "right")
@@ -353,17 +342,8 @@ class _TownImport(MapImport):
             row = supply.FacilityRow(
                 self._named(tags, element.id), kind, rules, *source, element.id, tagged, xy=xy
             )
-            rest = tagged or supply.expected_capacity(rule, area, supply.levels_of(tags))
-            for users in RESERVED_PLACES:
-                key = f"capacity:{users}"
-                n = 0 if tags.get(key) == "no" else count_in(tags, key, "no reserved place") or 0
-                if n > rest:
-                    note_unread(tags, key, "all places that are left")
-                if min(n, rest) > 0:
-                    row.counted.append((f"{row.name}, {users}", min(n, rest), replace(rules, users=users)))
-                    rest -= min(n, rest)
-            if rest:
-                row.counted.insert(0, (row.name, rest, rules))
+            places = tagged or supply.expected_capacity(rule, area, supply.levels_of(tags))
+            row.counted = supply.counted_parts(row.name, places, rules, tags)
             self.rows.append(row)
 
     def use_list(self, listed: list[supply.ListedCarPark]) -> None:
@@ -377,9 +357,7 @@ class _TownImport(MapImport):
             if k < 0:
                 xy_of = self._entrance(shapely.Point(point), [])
                 if xy_of is None or not car_park.capacity:
-                    self.left_out[
-                        "car parks of the list that the map lacks, without a street or a capacity"
-                    ].append(car_park.name)
+                    self.left_out[NOT_ON_MAP].append(car_park.name)
                     continue
                 row = supply.FacilityRow(car_park.name, "garage", supply.Rules(), "list", "", "", xy=xy_of)
                 self.rows.append(row)
@@ -411,8 +389,7 @@ class _TownImport(MapImport):
 
     def draft(self) -> TownDraft:
         require(self.rows, "no parking in it: no kerb, no car park and no garage beside its streets")
-        parts = [row.slots for row in self.rows]
-        slots = Slots.joined(parts)
+        slots, ids, zones = supply.zoned_slots(self.rows)
         mouths = np.concatenate([slots.mouths(), *([row.xy] for row in self.rows if row.xy is not None)])
         entries, traffic = self.streets.entries()
         is_guess = bool(self.n_bays) and not len(entries)
@@ -421,22 +398,12 @@ class _TownImport(MapImport):
         whole, lanes = self.streets.lanes(mouths, entries if self.beside is not None else None)
         # Of some car parks alone, the shortest ways are left, and none around what is forbidden.
         turns = turns_of(self.place, self.frame, whole, lanes) if self.beside is None else Turns((), (), ())
-        of = np.repeat(np.arange(len(self.rows)), [len(part) for part in parts])
-        used = dict.fromkeys(
-            (row.kind, rules)
-            for row in self.rows
-            for rules in (*row.slot_rules, *(r for _, _, r in row.counted), row.rules)
-        )
-        zones = {(kind, rules): rules.zone(kind) for kind, rules in used}
-        zone = np.array([zones[row.kind, own].name for row in self.rows for own in row.slot_rules], np.str_)
-        slots = replace(slots, zone=zone, facility=np.array([row.name for row in self.rows], np.str_)[of])
-        numbered = [[f"{row.element}-{i + 1}" for i in range(len(row.slots))] for row in self.rows]
-        ids = [name for row, names in zip(self.rows, numbered, strict=True) for name in row.slot_ids or names]
         to_lane = nearest_on_lanes(lanes, slots.mouths())[0] - slots.mouths()
         near = np.hypot(*to_lane.T) < SLOT_REACH - 0.01  # a file rounds
         self.left_out[NO_AISLE] += [ids[i] for i in np.flatnonzero(~near).tolist()]
         index = np.flatnonzero(near)
         slots, ids = slots[index], [ids[i] for i in index.tolist()]
+        source = {row.name: row.capacity_from for row in self.rows}
         filled = set(slots.facility.tolist())
         facilities = [f for row in self.rows for f in supply.facilities_of(row, filled)]
         goals, weights = weighted_goals(
@@ -450,7 +417,7 @@ class _TownImport(MapImport):
             name=self.name,
             slot_ids=tuple(ids),
             slots=slots,
-            slot_source=tuple(self.rows[k].capacity_from for k in of[index].tolist()),
+            slot_source=tuple(source[name] for name in slots.facility.tolist()),
             lanes=tuple(lanes),
             entries=entries,
             goals=goals,
@@ -460,7 +427,7 @@ class _TownImport(MapImport):
             ),
             frame=self.frame,
             facilities=tuple(facilities),
-            zone_rules={zone.name: zone for zone in zones.values()},
+            zone_rules=zones,
             goal_weights=weights,
             entry_weights=dict.fromkeys(PURPOSES, traffic),
             turns=turns.kept,
@@ -505,6 +472,22 @@ def _around_bays(
         raise InputError(f"{error}; {no_streets(register)}{swapped}") from error
 
 
+def _rules_of_bays(
+    given: Sequence[tuple[Rule, ...]],
+) -> tuple[dict[tuple[Rule, ...], supply.Rules], Counter[tuple[str, str, str]]]:
+    """Return the rules of bays as tags say them, and how many have what could not be read: part, text, assumed."""
+    rules, lost = {}, Counter[tuple[str, str, str]]()
+    for own, count in Counter(given).items():
+        tags, notes = tags_of(own)
+        with noting_unread() as unread:
+            rules[own] = supply.rules_of(tags)
+        for part, text, assumed in notes:
+            lost[part, text, assumed] += count
+        for note in unread_rows(unread):
+            lost[note.tag.removesuffix(":conditional"), rules_text(own), note.assumed] += count
+    return rules, lost
+
+
 def no_streets(register: Register) -> str:
     """Say how to get the streets of a register."""
     box = ",".join(f"{degrees:g}" for corner in register.box(AROUND_BAYS) for degrees in corner)
@@ -536,6 +519,17 @@ def _with_nodes_in_areas(elements: Sequence[OsmElement]) -> tuple[list[OsmElemen
             kept[own] = None
             kept[i] = replace(whole, tags={**node.tags, **(kept[i] or whole).tags})
     return [e for e in kept if e is not None], [e.id for (i, e) in nodes if kept[i] is None]
+
+
+def _car_parks_of(polygons: NDArray[np.object_], parking: Sequence[Area]) -> IntArray:
+    """Return the car park around each space, (n,), else a number beyond these for spaces near each other."""
+    near = shapely.STRtree(polygons).query(polygons, predicate="dwithin", distance=SAME_CAR_PARK)
+    owner = len(parking) + component_labels(near.T, len(polygons))
+    if parking:
+        tree = shapely.STRtree([a.polygon for a in parking])
+        space, park = tree.query(shapely.point_on_surface(polygons), predicate="intersects")
+        owner[space[::-1]] = park[::-1]
+    return owner
 
 
 def _unseen_garages(

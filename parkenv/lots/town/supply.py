@@ -31,6 +31,7 @@ from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.osm.conditions import (
     FREE,
     RESERVED,
+    RESERVED_PLACES,
     Charge,
     Conditional,
     access_layer,
@@ -314,6 +315,40 @@ class FacilityRow:
         default_factory=list
     )  # name, places, rules of counted parts
     xy: tuple[float, float] | None = None
+
+
+def counted_parts(
+    name: str, places: int, rules: Rules, tags: Mapping[str, str]
+) -> list[tuple[str, int, Rules]]:
+    """Divide the places of a counted facility: those for everybody, and those that tags reserve for some users."""
+    parts = []
+    for users in RESERVED_PLACES:
+        key = f"capacity:{users}"
+        n = 0 if tags.get(key) == "no" else count_in(tags, key, "no reserved place") or 0
+        if n > places:
+            note_unread(tags, key, "all places that are left")
+        if min(n, places) > 0:
+            parts.append((f"{name}, {users}", min(n, places), replace(rules, users=users)))
+            places -= min(n, places)
+    return [(name, places, rules), *parts] if places else parts
+
+
+def zoned_slots(rows: Sequence[FacilityRow]) -> tuple[Slots, list[str], dict[str, Zone]]:
+    """Return the slots of facilities with zone and facility, their ids, and the zones of all places by name."""
+    used = dict.fromkeys(
+        (row.kind, rules)
+        for row in rows
+        for rules in (*row.slot_rules, *(r for _, _, r in row.counted), row.rules)
+    )
+    zones = {(kind, rules): rules.zone(kind) for kind, rules in used}
+    slots = replace(
+        Slots.joined([row.slots for row in rows]),
+        zone=np.array([zones[row.kind, own].name for row in rows for own in row.slot_rules], np.str_),
+        facility=np.repeat(np.array([row.name for row in rows], np.str_), [len(row.slots) for row in rows]),
+    )
+    numbered = [[f"{row.element}-{i + 1}" for i in range(len(row.slots))] for row in rows]
+    ids = [name for row, names in zip(rows, numbered, strict=True) for name in row.slot_ids or names]
+    return slots, ids, {zone.name: zone for zone in zones.values()}
 
 
 def facilities_of(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
