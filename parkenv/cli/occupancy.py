@@ -190,4 +190,4 @@ def _show(
     print_rows(command.console, report.title, report.summary["rows"], keys, columns)
     command.say(*report.notes, soft_wrap=True)
     save_summary(out, seed, **report.summary)
-    command.say(f"Summaryand pictures are in {out}")
+    command.say(f"Summary and pictures are in {out}")
