@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
@@ -19,7 +18,6 @@ from parkenv.studies.fields import Seed
 from parkenv.studies.study import counted
 
 if TYPE_CHECKING:
-    from parkenv.perception.car_datasets import Crops, LabelledImage
     from parkenv.perception.car_model import CarModel
     from parkenv.perception.detector import Detector
 
@@ -135,12 +133,10 @@ class Detect(Command):
 
 
 class TrainDetector(Command):
-    """The model learns from photographs with labelled boxes, or from aligned crops and images without cars."""
+    """The model learns from aligned crops of cars and from images without cars."""
 
     examples = """
         parkenv train-detector --uiuc CarData --out side.npz
-        parkenv train-detector --labels coco.json --images pictures -o side.npz
-        parkenv train-detector --labels yolo --front -o front.npz
         parkenv train-detector --crops kitti --front --out front.npz \\
             --normalization blocks --penalty 0.02 \\
             --jitter 0 --misaligned 0 --enlarged 0
@@ -149,20 +145,6 @@ class TrainDetector(Command):
     uiuc: Path | None = option(None, "UIUC's folder: trains on TrainImages.", takes="DIR")
     crops: Path | None = option(
         None, "Instead: a folder with positives/, negatives/ (or vehicles/, non-vehicles/).", takes="DIR"
-    )
-    labels: Path | None = option(
-        None,
-        "Instead: labelled photographs, a file of COCO, or a folder of YOLO (images/ and labels/, or .txt "
-        "beside the pictures; names in data.yaml or classes.txt).",
-        takes="FILE.json|DIR",
-    )
-    images: Path | None = option(None, "Folder of the pictures of COCO.", takes="DIR", default="the file's")
-    classes: Several[str] | None = option(
-        None,
-        "Classes of the labels that are cars.",
-        takes="NAME[,...]",
-        default="car, van, truck, bus and the like",
-        min_length=1,
     )
     front: bool = option(False, "Train a model of fronts and rears, with a square window.")
     seed: Seed = Field(0, description="Seed of jitter and solver.")
@@ -178,21 +160,19 @@ class TrainDetector(Command):
     enlarged: float = option(
         2.0,
         "Factor by which crops are enlarged for further mining, so that parts of large cars "
-        "become negatives; 0: none, if the crops are not aligned. With --labels, the photographs "
-        "are mined instead.",
+        "become negatives; 0: none, if the crops are not aligned.",
     )
     out: Path = option(..., "The file to write.", short="-o", takes="FILE.npz")
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
-        sources = sum(source is not None for source in (self.uiuc, self.crops, self.labels))
-        require_together(sources == 1, "give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER")
         require_together(
-            self.labels or not (self.images or self.classes), "--images and --classes go with --labels"
+            (self.uiuc is None) != (self.crops is None), "give one of --uiuc FOLDER and --crops FOLDER"
         )
         return self
 
     def run(self) -> None:
+        from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
         from parkenv.perception.hog import Descriptor
         from parkenv.perception.hog_detector import END, SIDE
         from parkenv.perception.training import TrainingSettings, train
@@ -201,34 +181,25 @@ class TrainDetector(Command):
         check_writable(self.out)
         window = END if self.front else SIDE
         with self.console.status("Training") as status:
-            data, photos = self._photographs()
+            data = (
+                read_crop_folder(self.crops)
+                if self.crops is not None
+                else read_uiuc_training(Path(str(self.uiuc)))
+            )
             model = train(
                 data.positives,
                 data.negatives,
-                photos=photos,
-                window=None if self.labels is None else window,
                 descriptor=Descriptor(*window.size, self.normalization),
                 end_on=self.front,
                 settings=TrainingSettings(
                     self.penalty, self.rounds, self.jitter, self.misaligned, self.enlarged, self.seed
                 ),
                 trained_on=f"{len(data.positives)} crops and {len(data.negatives)} others in "
-                f"{self.uiuc or self.crops or self.labels}",
+                f"{self.uiuc or self.crops}",
                 progress=status.update,
             )
             model.save(self.out)
         self.say(f"Trained on {model.trained_on}. Written: {self.out}")
-
-    def _photographs(self) -> tuple[Crops, Sequence[LabelledImage]]:
-        from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
-        from parkenv.perception.labelled_folders import crops_of, read_labels
-
-        if self.labels is not None:
-            labelled = read_labels(self.labels, self.images, self.classes or ())
-            return crops_of(labelled, end_on=self.front, seed=self.seed)
-        if self.uiuc is not None:
-            return read_uiuc_training(self.uiuc), ()
-        return read_crop_folder(Path(str(self.crops))), ()
 
 
 class EvaluateDetector(Command):

@@ -12,7 +12,7 @@ from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.detector import overlaps
 from parkenv.perception.hog import Descriptor
-from parkenv.perception.hog_detector import CarWindow, HogDetector, best_boxes
+from parkenv.perception.hog_detector import HogDetector, best_boxes
 
 CAR_OVERLAP = 0.25
 _LEAST = 20
@@ -29,7 +29,7 @@ class TrainingSettings:
     rounds: int = 3  # rounds of hard-negative mining, each on another part of the images
     jitter: int = 4  # number of shifted and scaled copies of each positive
     misaligned: int = 2  # number of misaligned crops of each positive that become negatives
-    enlarged: float = 2.0  # without photographs, false positives are mined in crops enlarged so much; 0: none
+    enlarged: float = 2.0  # false positives are mined in crops enlarged so much, too; 0: none
     seed: int = 0  # seed of the jitter and the solver
 
     def __post_init__(self) -> None:
@@ -44,9 +44,7 @@ def train(
     positives: Sequence[Image],
     negatives: Sequence[Image],
     *,
-    photos: Sequence[LabelledImage] = (),
     descriptor: Descriptor | None = None,
-    window: CarWindow | None = None,
     end_on: bool = False,
     settings: TrainingSettings | None = None,
     trained_on: str = "",
@@ -56,13 +54,10 @@ def train(
 
     All crops are mirrored, and positives are jittered; windows with half a car are negatives from the start. In each
     following round the model scans the negative images, and its false positives join the negatives (Dalal and Triggs
-    2005): so do those in the photographs, or, where there are none, in the enlarged crops of cars and of others, for a
-    model that has only seen whole cars finds small ones in the parts of a large one. Probabilities are calibrated on
-    cross-validated scores (Platt 1999).
+    2005): so do those in the enlarged crops of cars and of others, for a model that has only seen whole cars finds
+    small ones in the parts of a large one. Probabilities are calibrated on cross-validated scores (Platt 1999).
 
-    Crops are grey, uint8; positives, at least 20, are aligned, with the car where it stands in the `window` (without
-    one, it fills them), and resized to that of the descriptor. False positives beside and within the labelled cars of
-    `photos` are mined, too.
+    Crops are grey, uint8; positives, at least 20, are filled by aligned cars, and resized to the descriptor's window.
     """
     if len(positives) < _LEAST or not negatives:
         raise InputError(
@@ -70,8 +65,7 @@ def train(
         )
     settings = settings or TrainingSettings()
     descriptor = descriptor or Descriptor()
-    height, width = positives[0].shape
-    car, aspect = ((0.0, 0.0, 1.0, 1.0), width / height) if window is None else (window.car, window.aspect)
+    aspect = positives[0].shape[1] / positives[0].shape[0]
     rng = np.random.default_rng(settings.seed)
     size = (descriptor.width, descriptor.height)
 
@@ -87,10 +81,17 @@ def train(
     no = np.stack([descriptor.describe(c) for c in others])
 
     model = CarModel(
-        descriptor, np.zeros(descriptor.shape, np.float32), 0.0, aspect, car, (1.0, 0.0), end_on, trained_on
+        descriptor,
+        np.zeros(descriptor.shape, np.float32),
+        0.0,
+        aspect,
+        (0.0, 0.0, 1.0, 1.0),
+        (1.0, 0.0),
+        end_on,
+        trained_on,
     )
     images = [LabelledImage("", n, _NO_CARS) for n in negatives]
-    images += photos or _enlarged(positives, negatives, car, settings.enlarged)
+    images += _enlarged(positives, negatives, settings.enlarged)
     for round_number in range(settings.rounds + 1):
         progress(f"round {round_number}: {len(yes)} positives, {len(no)} negatives")
         weights, bias = _svm(yes, no, settings)
@@ -106,9 +107,7 @@ def train(
     return replace(model, calibration=_calibration(yes, no, settings))
 
 
-def _enlarged(
-    positives: Sequence[Image], negatives: Sequence[Image], car: tuple[float, float, float, float], by: float
-) -> list[LabelledImage]:
+def _enlarged(positives: Sequence[Image], negatives: Sequence[Image], by: float) -> list[LabelledImage]:
     if not by:
         return []
 
@@ -117,7 +116,7 @@ def _enlarged(
 
     others = [LabelledImage("", larger(n), _NO_CARS) for n in negatives]
     cars = [larger(crop) for crop in positives]
-    boxes = [np.array([car]) * [*image.shape[::-1], *image.shape[::-1]] for image in cars]
+    boxes = [np.array([[0.0, 0.0, *image.shape[::-1]]]) for image in cars]
     return others + [LabelledImage("", image, box) for image, box in zip(cars, boxes, strict=True)]
 
 
