@@ -155,7 +155,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     rng = np.random.default_rng(0)
     true = rng.beta(4, 4, 400)
     log = sessions(np.zeros(12), rng.random((12, 400)) < true)
-    found = predict(log, 0.0, confidence=0.9)
+    found = predict(log, 0.0)
     inside = ((found.low <= true) & (true <= found.high)).mean()
     assert 0.8 < inside <= 1.0
 

@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import print_rows, print_table, save_summary, stages
-from parkenv.errors import InputError, nearest, require
+from parkenv.errors import require
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, LocaliserName, RigName, WeatherName
@@ -132,7 +132,7 @@ class Map(Command):
 
     examples = """
         parkenv map results/survey/map.sqlite --weekday tue --hour 9.5
-        parkenv map results/survey/map.sqlite --slot A3 --out results/map
+        parkenv map results/survey/map.sqlite --out results/map
         """
 
     map_file: Path = option(..., "A map file of `parkenv survey`.", name="FILE", argument=True)
@@ -141,8 +141,6 @@ class Map(Command):
         None, "mon, tue, ..., sun.", takes="DAY", default="the mean over all sessions"
     )
     hour: float = option(9.0, "Hour of the day, with --weekday.", takes="H", ge=0, le=24)
-    slot: str | None = option(None, "Show only this slot.", takes="ID", default="all")
-    confidence: float = option(0.9, "Probability of the interval.", takes="P", gt=0, lt=1)
     out: Path | None = option(
         None, "Folder for map.png, slots.csv, summary.json.", short="-o", default="none"
     )
@@ -153,20 +151,15 @@ class Map(Command):
         from parkenv.scenarios.build import build
         from parkenv.show.figures.survey import save_map
 
-        scenario, slot, hour = build(self.scenario), self.slot, self.hour
-        lot, ids = scenario.lot, scenario.lot.slot_ids
-        if slot is not None and slot not in ids:
-            hint = nearest(slot, ids) if len(ids) <= MOST_ROWS else nearest(slot, ids).partition("known:")[0]
-            raise InputError(
-                f"--slot {slot}: lot {scenario.name!r} has no such slot; {hint or f'its first is {ids[0]!r}'}"
-            )
+        scenario, hour = build(self.scenario), self.hour
+        lot = scenario.lot
         with MapStore(self.map_file, lot, create=False) as store:
             log = store.log()
         time, when = None, "over all sessions"
         if self.weekday is not None:
             time = DAY_NAMES.index(self.weekday) * DAY_S + min(hour * HOUR_S, DAY_S - 1.0)
             when = f"{self.weekday} {int(hour):02d}:{int(hour % 1 * 60):02d}"
-        predicted = predict(log, time, confidence=self.confidence)
+        predicted = predict(log, time)
         rows = [
             {
                 "slot": name,
@@ -175,8 +168,7 @@ class Map(Command):
                 "high": float(predicted.high[i]),
                 "sessions": int(predicted.sessions[i]),
             }
-            for i, name in enumerate(ids)
-            if slot in (None, name)
+            for i, name in enumerate(lot.slot_ids)
         ]
         free = sorted(rows, key=lambda row: float(str(row["p_occupied"])))[:MOST_ROWS]
         print_rows(self.console, f"{scenario.name}, {when}, {plural(len(log.time), 'session')}", free)

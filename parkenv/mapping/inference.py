@@ -8,7 +8,7 @@ from scipy.special import expit, logit
 from scipy.stats import beta
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, require_number
+from parkenv.errors import InputError
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.week import DAY_S, HOUR_S
@@ -23,6 +23,7 @@ OTHER_WEEKDAY = 0.85
 In leave-one-day-out tests on CNRPark-EXT, values from 0.7 to 1 predict equally well and lower ones worse: a Monday
 predicts a Tuesday as well as another Tuesday does.
 """
+CONFIDENCE = 0.9  # probability of the interval of a prediction
 _HOUR_WIDTH = 1.0
 
 
@@ -56,7 +57,7 @@ def counted(log: SessionLog) -> FloatArray:
     return np.where(seen > 0, (log.occupied & log.known).sum(axis=0) / np.maximum(seen, 1), 0.5)
 
 
-def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0.9) -> Prediction:
+def predict(log: SessionLog, time: float | None = None) -> Prediction:
     """Predict the occupancy of every slot at a time of the week, or over all sessions.
 
     Counts back off from specific to general: the slot at this hour of this weekday; the slot at this hour on days of
@@ -68,7 +69,6 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
     """
     if not len(log.time):
         raise InputError("the map holds no session, want at least one")
-    require_number("confidence", confidence, above=0.0, below=1.0)
     taken, known = (log.occupied & log.known).astype(np.float64), log.known.astype(np.float64)
     lot_mean = (taken.sum() + 1.0) / (known.sum() + 2.0)
     weight = np.ones(len(log.time)) if time is None else _alike(log.time, time)
@@ -80,7 +80,7 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
         base = expit(logit(slot_mean) + logit(at_hour) - logit(lot_mean))
     a = weight @ taken + SLOT_WEIGHT * base
     b = weight @ known + SLOT_WEIGHT - a
-    tail = 0.5 * (1.0 - confidence)
+    tail = 0.5 * (1.0 - CONFIDENCE)
     return Prediction(
         a / (a + b),
         np.asarray(beta.ppf(tail, a, b)),
