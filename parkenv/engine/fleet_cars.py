@@ -17,7 +17,7 @@ from parkenv.files.field_types import NotNegative, Validated, Whole
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.world.demand import CarPlans, Demand, TownDemand
 from parkenv.world.occupancy.process import ArrivalDay
-from parkenv.world.scenario import Drivers, Scenario, drive_times
+from parkenv.world.scenario import Drivers, Scenario, drive_times, zone_prices
 from parkenv.world.week import DAY_S
 
 # Chance that a free slot was taken when a car came that is parked at first: it stands in the first slot that was not.
@@ -183,7 +183,7 @@ class FleetCars:
         scenario, cars, lot = self._scenario, self.records, self._scenario.lot
         if not scenario.has_rules and (cars["walks"] == 1.0).all():
             return None
-        if not np.isfinite(scenario.zone_price(self.drivers)).all():
+        if not np.isfinite(zone_prices(scenario.zone_rules, self.drivers)).all():
             raise InputError("Demand.stays: a stay is infinite, want finite ones where parking has a price")
         zone_cost_s = self.zone_costs()
         cars["n_forbidden"] = np.isinf(zone_cost_s) @ np.bincount(lot.zone_of_slot, minlength=len(lot.zones))

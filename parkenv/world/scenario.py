@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -181,21 +181,7 @@ class SearchProblem(Validated):
         charges it.
         """
         seconds = HOUR_S / np.asarray(drivers.value_of_time, np.float64)[..., None]
-        return np.where(self.admits(drivers), self.zone_price(drivers) * seconds, np.inf)
-
-    def zone_price(self, drivers: Drivers) -> FloatArray:
-        """Return what drivers pay in each of the lot's zones, (..., n_zones) in the currency of the prices."""
-        arrival, stay, kwh = np.broadcast_arrays(drivers.arrival_s, drivers.stay_s, drivers.kwh)
-        amounts, seconds = [], dict[Hours, FloatArray]()
-        for price in (zone.price for zone in self.zone_rules):
-            if price.hourly and price.daily_cap is None and not price.per_kwh:
-                # Many zones share their hours.
-                for hours in (hours for hours, _ in price.hourly if hours not in seconds):
-                    seconds[hours] = hours.within(arrival, stay)
-                amounts.append(price.of_hours(seconds))
-            else:
-                amounts.append(price.amount(arrival, stay, kwh))
-        return np.stack(amounts, axis=-1)
+        return np.where(self.admits(drivers), zone_prices(self.zone_rules, drivers) * seconds, np.inf)
 
     def admits(self, drivers: Drivers) -> BoolArray:
         """Return whether drivers may park in each of the lot's zones, (..., n_zones) bool."""
@@ -420,6 +406,21 @@ class Scenario(SearchProblem):
     def forecast(self, arrival: Arrival) -> Forecast:
         """Return the forecast for a search that starts at the arrival."""
         return (self.prior or self.occupancy).forecast(arrival)
+
+
+def zone_prices(zones: Sequence[Zone], drivers: Drivers) -> FloatArray:
+    """Return what drivers pay in each of some zones, (..., n_zones) in the currency of the prices."""
+    arrival, stay, kwh = np.broadcast_arrays(drivers.arrival_s, drivers.stay_s, drivers.kwh)
+    amounts, seconds = [], dict[Hours, FloatArray]()
+    for price in (zone.price for zone in zones):
+        if price.hourly and price.daily_cap is None and not price.per_kwh:
+            # Many zones share their hours.
+            for hours in (hours for hours, _ in price.hourly if hours not in seconds):
+                seconds[hours] = hours.within(arrival, stay)
+            amounts.append(price.of_hours(seconds))
+        else:
+            amounts.append(price.amount(arrival, stay, kwh))
+    return np.stack(amounts, axis=-1)
 
 
 def drive_times(problem: SearchProblem, vertex: int | IntArray) -> FloatArray:

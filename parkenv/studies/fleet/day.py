@@ -20,7 +20,7 @@ from parkenv.studies.results import Row
 from parkenv.studies.statistics import mean_or_nan
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.drive_graph import linestrings
-from parkenv.world.scenario import Scenario, SearchProblem, drive_metres
+from parkenv.world.scenario import Scenario, SearchProblem, drive_metres, zone_prices
 from parkenv.world.tariff import NO_ZONE
 from parkenv.world.week import DAY_S, HOUR_S
 
@@ -138,7 +138,7 @@ class Day(NamedTuple):
     def paid(self) -> FloatArray:
         cars, scenario = self.fleet.cars, self.fleet.scenario
         zone = scenario.lot.zone_of_slot[cars["slot"]]
-        amounts = scenario.zone_price(self.fleet.drawn.drivers)[np.arange(len(cars)), zone]
+        amounts = zone_prices(scenario.zone_rules, self.fleet.drawn.drivers)[np.arange(len(cars)), zone]
         return np.where(cars["slot"] >= 0, amounts, 0.0)
 
 
