@@ -1,39 +1,63 @@
-"""Batches of environments as stable-baselines3's `VecEnv`."""
+"""Batches of searches as stable-baselines3's `VecEnv`."""
 
 from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 
 from parkenv.envs.search_vector import ParkSearchVectorEnv
-from parkenv.errors import InputError, require_number
+from parkenv.errors import require_number
 from parkenv.scenarios.build import ScenarioSources
 
 
-class BatchVecEnv(VecEnv):  # type: ignore[misc]
-    """A Gymnasium batch that begins new episodes in the same step, for stable-baselines3 and sb3-contrib.
+class SearchVecEnv(VecEnv):  # type: ignore[misc]
+    """A compiled batch of searches, `parkenv.envs.search_vector.ParkSearchVectorEnv`, for stable-baselines3.
 
     Attributes and methods belong to the whole batch. When an episode ends, its `info` has `terminal_observation`,
-    `TimeLimit.truncated`, `episode` (return and length, as from `Monitor`, so no wrapper is needed) and the values of
-    the batch's `info["final_info"]`, such as the metrics of a search. If observations have an `action_mask`,
-    sb3-contrib finds it. `reward_scale` is a factor of the rewards; returns near one are easiest to learn.
+    `TimeLimit.truncated`, `episode` (return and length, as from `Monitor`, so no wrapper is needed) and the metrics of
+    the search. sb3-contrib finds the action masks. `set_options` takes the options of `reset`, one dictionary or one
+    for each search; they hold for the next reset.
+
+    Args:
+        num_envs: number of searches.
+        scenario: a scenario, its name, a file, a folder of files, or a sequence of these; if there are several, one is
+            drawn for each episode, and `info["scenario_index"]` is its index at the end.
+        reward_scale: factor of the rewards in seconds; returns near one are easiest to learn.
+        k: number of slots in the `local` observation, 5 if None.
+        observation: `local`; for a single lot also `full`.
+        max_episode_steps: steps after which a search is truncated.
 
     Raises:
-        InputError: another mode than `AutoresetMode.SAME_STEP`, or a scale that is no number above 0.
+        InputError: an argument out of its range; the message names it.
+
+    Examples:
+        >>> venv = SearchVecEnv(4, "mini")
+        >>> venv.seed(0)
+        [0, 1, 2, 3]
+        >>> venv.reset()["local"].shape
+        (4, 86)
     """
 
     actions: NDArray[Any]
     __copy__ = deepcopy
 
-    def __init__(self, batch: VectorEnv[Any, Any, Any], reward_scale: float = 1.0) -> None:
-        if batch.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
-            raise InputError(f"autoreset_mode is {batch.metadata['autoreset_mode']}, want SAME_STEP")
+    def __init__(
+        self,
+        num_envs: int,
+        scenario: ScenarioSources = "campus",
+        reward_scale: float = 1.0,
+        k: int | None = None,
+        observation: str = "local",
+        max_episode_steps: int = 2000,
+    ) -> None:
         require_number("reward_scale", reward_scale, above=0.0)
-        super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
-        self.batch: Any = batch
+        self.batch = ParkSearchVectorEnv(
+            num_envs, scenario, observation, k, max_episode_steps, AutoresetMode.SAME_STEP
+        )
+        super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
         self.reward_scale = reward_scale
         self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.int64)
         self._masks: NDArray[Any] = np.zeros((self.num_envs, 0), np.bool_)
@@ -48,11 +72,8 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._returns[:], self._lengths[:] = 0.0, 0
-        self._keep_masks(observations)
+        self._masks = np.array(observations["action_mask"], np.bool_)
         return dict(observations)
-
-    def _keep_masks(self, observations: Any) -> None:
-        self._masks = np.array(observations.get("action_mask", self._masks), np.bool_)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self.actions = np.asarray(actions)
@@ -61,15 +82,13 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         self,
     ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         observations, rewards, terminated, truncated, info = self.batch.step(self.actions)
-        self._keep_masks(observations)
+        self._masks = np.array(observations["action_mask"], np.bool_)
         self._returns += rewards
         self._lengths += 1
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         final = info.get("final_info", {})
-        named = [
-            name for name, values in final.items() if f"_{name}" in final and not isinstance(values, dict)
-        ]
+        named = [name for name in final if f"_{name}" in final]
         for i in np.flatnonzero(done).tolist():
             infos[i] = {
                 "terminal_observation": info["final_obs"][i],
@@ -109,43 +128,3 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
         from stable_baselines3.common.monitor import Monitor
 
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
-
-
-class SearchVecEnv(BatchVecEnv):
-    """A compiled batch of searches, `parkenv.envs.search_vector.ParkSearchVectorEnv`, for stable-baselines3.
-
-    Args:
-        num_envs: number of searches.
-        scenario: a scenario, its name, a file, a folder of files, or a sequence of these; if there are several, one is
-            drawn for each episode, and `info["scenario_index"]` is its index at the end.
-        reward_scale: factor of the rewards in seconds; returns near one are easiest to learn.
-        k: number of slots in the `local` observation, 5 if None.
-        observation: `local`; for a single lot also `full`.
-        max_episode_steps: steps after which a search is truncated.
-
-    `set_options` takes the options of `reset`, one dictionary or one for each search; they hold for the next reset.
-
-    Raises:
-        InputError: an argument out of its range; the message names it.
-
-    Examples:
-        >>> venv = SearchVecEnv(4, "mini")
-        >>> venv.seed(0)
-        [0, 1, 2, 3]
-        >>> venv.reset()["local"].shape
-        (4, 86)
-    """
-
-    def __init__(
-        self,
-        num_envs: int,
-        scenario: ScenarioSources = "campus",
-        reward_scale: float = 1.0,
-        k: int | None = None,
-        observation: str = "local",
-        max_episode_steps: int = 2000,
-    ) -> None:
-        batch = ParkSearchVectorEnv(
-            num_envs, scenario, observation, k, max_episode_steps, AutoresetMode.SAME_STEP
-        )
-        super().__init__(batch, reward_scale)
