@@ -23,8 +23,6 @@ from parkenv.lots import check_lot, grid_lot, import_lot, packaged_lot, read_lot
 from parkenv.lots.draft import ImportOptions, Provenance, read_provenance
 from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.spaces import spaces_from_outlines
-from parkenv.scenarios.build import largest_lots
-from parkenv.scenarios.spec import scenario_specs
 from parkenv.show.scene import PALETTE
 from parkenv.studies.lots import COLUMNS, check_drivability, count_lot, lot_columns, lot_files
 from parkenv.world.lot import Lane, ParkingLot
@@ -425,9 +423,3 @@ def test_what_is_no_lot_is_named_and_the_others_are_counted(lots, tmp_path):
         with pytest.raises(InputError, match=message):
             lot_files([place])
         assert message in refused("lot", "census", place)
-
-
-def test_the_largest_lots_are_chosen(lots):
-    specs = scenario_specs(lots)
-    assert [spec.title for spec in largest_lots(specs, 2)] == ["a", "b"]
-    assert len(largest_lots(specs, 9)) == 3

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
 
 # Commands of studies that have options besides the fields of the study, in `parkenv.cli.study_commands`.
-WITH_MORE = {"compare": "Compare", "survey": "Survey", "demo": "Demo", "park": "Park"}
+WITH_MORE = {"survey": "Survey", "demo": "Demo", "park": "Park"}
 
 KINDS = ("scenario", *STUDIES)  # kinds of files that have a schema
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from parkenv.cli.options import Command, Given
+from parkenv.cli.options import Command
 from parkenv.cli.report import make_report
 from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import print_rows, save_summary, stages
@@ -29,22 +29,6 @@ from parkenv.studies.trips.manoeuvre_study import ManoeuvreStudy
 
 if TYPE_CHECKING:
     from parkenv.studies.runner import Result
-
-
-class Compare(StudyCommand):
-    largest: int | None = option(
-        None, "Use only the scenarios with the N largest lots.", panel="World", default="all", ge=1
-    )
-
-    @classmethod
-    def of(cls, given: Given) -> Self:
-        command = super().of(given)
-        if command.largest is None:
-            return command
-        from parkenv.scenarios.build import largest_lots
-
-        scenarios = largest_lots(command.study.scenarios, command.largest)  # type: ignore[attr-defined]
-        return command.changed(study=command.study.changed(scenarios=tuple(scenarios)))
 
 
 class Survey(StudyCommand):

@@ -135,10 +135,6 @@ def require_changes(owners: Sequence[type], changes: Iterable[str], *others: str
     )
 
 
-def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec]:
-    return sorted(specs, key=lambda spec: -_lot(spec.lot).n_slots)[:count]
-
-
 def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:
     goal = changes.get("goal", 0)
     occupancy = changes.get("occupancy") or with_full_facilities(typical_occupancy(lot, goal=goal), lot)

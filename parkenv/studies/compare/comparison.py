@@ -169,7 +169,7 @@ class Comparison(CaseStudy):
         parkenv compare --scenario campus,jam --failure-cost 10,90 --out results
         parkenv compare --agents "mdp(failure_s=90),belief,oracle" --report
         parkenv compare --agents mdp,mdp-tuned,oracle --failure-cost sweep
-        parkenv compare --scenario lots --largest 5 --report
+        parkenv compare --scenario lots --report
         parkenv compare --lot lot.geojson --occupancy log.csv.gz -n 300
         parkenv compare --resume --episodes 1000
         """
