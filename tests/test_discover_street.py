@@ -1,6 +1,5 @@
 """Slots and lanes of an unknown street, from parked cars that drives have passed."""
 
-import csv
 import json
 import math
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import ran
+from command_line import ran, rows_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -147,10 +146,7 @@ def test_a_packaged_lot_is_found_from_its_cars(name, tmp_path):
 @pytest.mark.skipif(not DRIVES.exists(), reason="the drives of shared/data are not here")
 @pytest.mark.parametrize(("name", "gaps"), [("kitti_0039a", 11), ("kitti_0001", 2)])
 def test_real_cars_are_found_where_they_park(name, gaps):
-    rows = {
-        table: list(csv.DictReader((DRIVES / name / f"{table}.csv").open()))
-        for table in ("cars", "slots", "poses")
-    }
+    rows = {table: rows_in(DRIVES / name / f"{table}.csv") for table in ("cars", "slots", "poses")}
     xy = {table: np.array([[float(r["x"]), float(r["y"])] for r in its]) for table, its in rows.items()}
     parked = np.array([int(r["n"]) >= 5 for r in rows["cars"]])
     yaw = float(rows["poses"][-1]["yaw"])

@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 KIND = "sensor_msgs/msg/CompressedImage"
 LARGE = 3_000_000
 """Bytes of a message that hardly take room when they are packed."""
+PACKED = [("MCAP", "STORAGE"), ("MCAP", "MESSAGE"), ("SQLITE3", "MESSAGE"), ("ROS1", "BZ2"), ("ROS1", "LZ4")]
 
 
 def message(store, size, *first):
@@ -54,9 +55,6 @@ def sizes(path):
     """The sizes of all messages' data."""
     with open_recording(path) as (types, messages):
         return [len(message.data) for _, _, message in messages(set(types))]
-
-
-PACKED = [("MCAP", "STORAGE"), ("MCAP", "MESSAGE"), ("SQLITE3", "MESSAGE"), ("ROS1", "BZ2"), ("ROS1", "LZ4")]
 
 
 @pytest.mark.parametrize(("plugin", "mode"), PACKED)

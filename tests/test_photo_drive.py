@@ -38,6 +38,7 @@ from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.rig import RIGHT, Mount
 
 CAMERA = PinholeCamera.from_field_of_view(1280, 960, math.pi / 2)
+PLAIN, HOG = DetectorErrors(), HogDetector.errors
 GPX = '<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{}</trkseg></trk></gpx>'
 POINT = '<trkpt lat="{:.9f}" lon="{:.9f}"><time>{}</time></trkpt>'
 
@@ -75,13 +76,7 @@ def test_exact_boxes_of_usual_cars_give_the_exact_distance(ahead, aside, view, h
 
 
 @pytest.mark.parametrize(
-    ("detector", "view", "ahead"),
-    [
-        (DetectorErrors(), 0, 5.0),
-        (HogDetector.errors, 1, 5.0),
-        (DetectorErrors(), 2, 11.0),
-        (HogDetector.errors, 0, 11.0),
-    ],
+    ("detector", "view", "ahead"), [(PLAIN, 0, 5.0), (HOG, 1, 5.0), (PLAIN, 2, 11.0), (HOG, 0, 11.0)]
 )
 def test_the_stated_deviation_is_that_of_the_error(detector, view, ahead):
     """Boxes, pitch, and cars as uncertain as stated: as many errors within 1 and 2 deviations as of a normal one."""
@@ -101,7 +96,7 @@ def test_the_stated_deviation_is_that_of_the_error(detector, view, ahead):
     assert (off < 2.0).mean() > 0.9
 
 
-@pytest.mark.parametrize(("detector", "pitch"), [(DetectorErrors(), -4.0), (HogDetector.errors, 4.0)])
+@pytest.mark.parametrize(("detector", "pitch"), [(PLAIN, -4.0), (HOG, 4.0)])
 def test_boxes_that_end_above_the_horizon_are_no_cars(detector, pitch):
     """However probable, and as high and wide as a car: the ground is elsewhere."""
     ground, tall = view_of(pitch=pitch), 250.0
@@ -116,9 +111,7 @@ def test_boxes_that_end_above_the_horizon_are_no_cars(detector, pitch):
 def test_cars_of_a_street_tell_how_high_the_camera_looks(raised):
     """Their height does, however far away they are; without a car nothing does."""
     true, said = view_of(pitch=-2.0 + raised), view_of(pitch=-2.0)
-    boxes = np.array(
-        [usual_box(true, ahead, aside, 2) for ahead in (7.0, 10.0, 14.0) for aside in (-1.0, 1.0)]
-    )
+    boxes = np.array([usual_box(true, x, y, 2) for x in (7.0, 10.0, 14.0) for y in (-1.0, 1.0)])
     sure = np.ones(len(boxes), np.float32)
     seen = [(Detections(boxes[k : k + 1], sure[:1], sure[:1] > 0), said) for k in range(len(boxes))] * 5
     pitch, error = street_pitch(seen, RangingErrors())
@@ -203,9 +196,7 @@ def test_no_heading_is_made_across_a_gap(tmp_path):
     frame = LocalFrame(7.85, 48.0)
     parts = [[(3.0 * k, 0.0) for k in range(6)], [(50.0, 80.0)], [(90.0, 60.0 + 3.0 * k) for k in range(6)]]
     for gap in (1, 60):
-        rows = [
-            (60 * 0 + k + gap * i, i, *p) for i, part in enumerate(parts) for k, p in enumerate(part, 6 * i)
-        ]
+        rows = [(k + gap * i, i, *p) for i, part in enumerate(parts) for k, p in enumerate(part, 6 * i)]
         segments = {0: "", 1: "", 2: ""}
         table = [("time", "x", "y", "segment") if gap == 1 else ("time", "x", "y", "speed")]
         for second, i, x, y in rows:
@@ -280,9 +271,8 @@ def test_photographs_without_what_they_need_are_refused_in_a_line(tmp_path, pose
 
 @pytest.mark.slow
 def test_a_drive_is_mapped_from_its_photographs_and_from_a_film_with_a_track(tmp_path):
-    survey = Survey(
-        make_scenario("mini"), SurveySettings(rig="camera", every=1.5, weather="overcast", seed=7)
-    )
+    settings = SurveySettings(rig="camera", every=1.5, weather="overcast", seed=7)
+    survey = Survey(make_scenario("mini"), settings)
     drive, lot = survey.draw(0), survey.scenario.lot
     truth = drive.world.occupied(np.arange(lot.n_slots), drive.times[-1])
     photos, begin = tmp_path / "photos", datetime.datetime(2026, 5, 4, 9, tzinfo=datetime.UTC)

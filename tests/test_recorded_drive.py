@@ -79,11 +79,10 @@ def bag(folder, poses=11, pictures=5, pose_type="nav_msgs/msg/Odometry", shift=(
         return t[pose_type](header(stamp), "", t["geometry_msgs/msg/PoseWithCovariance"](at, zeros), twist)
 
     def picture(stamp, k):
+        bgr = image(k)[..., ::-1]
         if raw:
-            return t["sensor_msgs/msg/Image"](
-                header(stamp), HEIGHT, WIDTH, "bgr8", 0, 3 * WIDTH, image(k)[..., ::-1].ravel()
-            )
-        data = cv2.imencode(".png", image(k)[..., ::-1])[1].ravel()
+            return t["sensor_msgs/msg/Image"](header(stamp), HEIGHT, WIDTH, "bgr8", 0, 3 * WIDTH, bgr.ravel())
+        data = cv2.imencode(".png", bgr)[1].ravel()
         return t["sensor_msgs/msg/CompressedImage"](header(stamp), "png", data)
 
     def scan(stamp, k):
@@ -115,10 +114,9 @@ def calibrated(tmp_path, text=CALIBRATION):
     return DriveCalibration.read(tmp_path / "car.toml")
 
 
-@pytest.mark.parametrize(
-    ("raw", "pose_type"), [(True, "nav_msgs/msg/Odometry"), (False, "geometry_msgs/msg/PoseStamped")]
-)
-def test_a_bag_of_somebodys_car_becomes_captures(tmp_path, raw, pose_type):
+@pytest.mark.parametrize("raw", [True, False])
+def test_a_bag_of_somebodys_car_becomes_captures(tmp_path, raw):
+    pose_type = "nav_msgs/msg/Odometry" if raw else "geometry_msgs/msg/PoseStamped"
     file = bag(tmp_path / "bag", raw=raw, pose_type=pose_type)
     drive = RecordedDrive(file, calibrated(tmp_path))
     assert drive.start == 10 * 3600.0
@@ -217,9 +215,8 @@ def test_topics_that_are_no_pictures_in_colour_are_listed(tmp_path, encoding, re
             writer.write(connection, 10**9, store.serialize_cdr(message, message.__msgtype__))
         writer.add_connection("/silent", color.__msgtype__, typestore=store)
     done = ran("detect", tmp_path / "bag/bag", "--out", tmp_path / "found")
-    topics = {
-        row["file"].split(":")[1]: row["reason"] for row in summary_of(tmp_path / "found")["not_searched"]
-    }
+    left_out = summary_of(tmp_path / "found")["not_searched"]
+    topics = {row["file"].split(":")[1]: row["reason"] for row in left_out}
     assert topics.pop("/silent") == "has no messages"
     assert "/color: 1 frame" in done.stdout
     assert list(topics) == (["/depth"] if reason else [])
@@ -250,11 +247,8 @@ def test_each_scan_is_read_with_its_own_angles():
     ]
     scans = [scan_of(message) for message in messages]
     scanner, ranges = common_scanner(scans)
-    assert (scanner.n_beams, scanner.start, scanner.step) == (
-        201,
-        pytest.approx(rad(-100)),
-        pytest.approx(rad(1)),
-    )
+    assert scanner.n_beams == 201
+    assert (scanner.start, scanner.step) == pytest.approx((rad(-100), rad(1)))
     for scan, _message, row in zip(scans, messages, ranges, strict=True):
         hit = np.isfinite(row)
         assert hit.sum() >= len(scan.ranges)
@@ -294,9 +288,8 @@ def test_limits_are_no_hits():
 def test_orientations_of_any_near_norm_say_the_same_heading(norm):
     for yaw in np.linspace(-3.1, 3.1, 9):
         z, w = norm * math.sin(yaw / 2), norm * math.cos(yaw / 2)
-        at = SimpleNamespace(
-            position=SimpleNamespace(x=1.0, y=2.0), orientation=SimpleNamespace(x=0.0, y=0.0, z=z, w=w)
-        )
+        turned = SimpleNamespace(x=0.0, y=0.0, z=z, w=w)
+        at = SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0), orientation=turned)
         assert pose_of(SimpleNamespace(pose=at))[:3] == pytest.approx((1.0, 2.0, yaw))
         for factor in (0.0, 0.2, 9.0, math.nan):
             at.orientation.z, at.orientation.w = z * factor, w * factor

@@ -57,17 +57,8 @@ def cloud(points, stamp=START, frame="lidar", kind="f4", order="<", offset=0, wi
     fields = [T["PointField"](n, dtype.fields[n][1], {"f4": 7, "f8": 8}[kind], 1) for n in "xyz"]
     width = width or len(points)
     data = rows.view(np.uint8).copy()
-    return T["PointCloud2"](
-        header(stamp, frame),
-        len(points) // width,
-        width,
-        fields,
-        order == ">",
-        size,
-        width * size,
-        data,
-        True,
-    )
+    layout = (len(points) // width, width, fields, order == ">", size, width * size)
+    return T["PointCloud2"](header(stamp, frame), *layout, data, True)
 
 
 def header(stamp, frame):
@@ -81,9 +72,8 @@ def test_clouds_of_any_layout_are_the_same_points(kind, order):
     points[3, 1] = np.nan
     wanted = np.delete(points, 3, axis=0)
     for offset, width in ((0, None), (5, 4)):
-        np.testing.assert_array_equal(
-            points_of(cloud(points, kind=kind, order=order, offset=offset, width=width)), wanted
-        )
+        found = points_of(cloud(points, kind=kind, order=order, offset=offset, width=width))
+        np.testing.assert_array_equal(found, wanted)
     bad = cloud(points)
     bad.fields[2].name = "w"
     with pytest.raises(InputError, match="a cloud has the fields x, y, w, want x, y and z"):
@@ -140,30 +130,21 @@ def info(frame, shift=0.0):
 def drive(skip=(), poses="fix", right_late=0, sides=("left",), lidar_roll=0.0, late=0):
     """The messages of a car that drives east at 5 m/s: its frames say where its sensors are."""
     turned = Rotation.from_euler("x", lidar_roll, degrees=True)
-    links = [
-        ("base_link", "imu", (0.0, 0.0, 0.4), Rotation.identity()),
-        ("base_link", "lidar", (1.0, 0.1, 1.3), turned),
-    ]
-    links += [
-        ("base_link", f"{side}_optical", (1.5, 0.2 - 0.5 * k, 1.2), Rotation.from_matrix(OPTICAL))
-        for k, side in enumerate(("left", "right"))
-    ]
-    yield "/tf_static", START, T["TFMessage"]([transform(*link) for link in links])
+    links = [("imu", (0.0, 0.0, 0.4), Rotation.identity()), ("lidar", (1.0, 0.1, 1.3), turned)]
+    camera = Rotation.from_matrix(OPTICAL)
+    links += [(f"{side}_optical", (1.5, y, 1.2), camera) for side, y in (("left", 0.2), ("right", -0.3))]
+    yield "/tf_static", START, T["TFMessage"]([transform("base_link", *link) for link in links])
     frame, none = LocalFrame(8.0, 48.0), T["Vector3"](0.0, 0.0, 0.0)
     for k in range(11):
         stamp = START + k * 10**8
         x, yaw = 0.5 * k, Rotation.from_euler("ZYX", [0.0, 0.02 * (k == 5), 0.0])
         (lon, lat), late_ns = frame.to_lonlat([[x, 0.0]])[0], stamp + late * 10**9
+        head, still = header(stamp, "imu"), np.zeros(9)
+        points = scene() * np.float32([1, *[math.cos(math.radians(lidar_roll))] * 2])
         messages = {
-            "/fix": T["NavSatFix"](
-                header(stamp, "imu"), T["NavSatStatus"](0, 1), lat, lon, 0.0, np.full(9, 0.04), 2
-            ),
-            "/imu": T["Imu"](
-                header(stamp, "imu"), quaternion(yaw), np.zeros(9), none, np.zeros(9), none, np.zeros(9)
-            ),
-            "/lidar": cloud(
-                scene() * np.float32([1, *[math.cos(math.radians(lidar_roll))] * 2]), late_ns + 2 * 10**7
-            ),
+            "/fix": T["NavSatFix"](head, T["NavSatStatus"](0, 1), lat, lon, 0.0, np.full(9, 0.04), 2),
+            "/imu": T["Imu"](head, quaternion(yaw), still, none, still, none, still),
+            "/lidar": cloud(points, late_ns + 2 * 10**7),
         }
         if poses == "tf":
             del messages["/fix"], messages["/imu"]
@@ -173,19 +154,11 @@ def drive(skip=(), poses="fix", right_late=0, sides=("left",), lidar_roll=0.0, l
             )  # fmt: skip
         for i, side in enumerate(sides):
             at = late_ns + (right_late if side == "right" else 0)
-            picture = T["Image"](
-                header(at, f"{side}_optical"),
-                HEIGHT,
-                WIDTH,
-                "mono8",
-                0,
-                WIDTH,
-                np.full(HEIGHT * WIDTH, k, np.uint8),
-            )
-            messages |= {
-                f"/{side}/image_raw": picture,
-                f"/{side}/camera_info": info(f"{side}_optical", -F * 0.5 * i),
-            }
+            grey = np.full(HEIGHT * WIDTH, k, np.uint8)
+            optical = f"{side}_optical"
+            picture = T["Image"](header(at, optical), HEIGHT, WIDTH, "mono8", 0, WIDTH, grey)
+            messages[f"/{side}/image_raw"] = picture
+            messages[f"/{side}/camera_info"] = info(optical, -F * 0.5 * i)
         yield from ((topic, stamp, message) for topic, message in messages.items() if topic not in skip)
 
 
@@ -198,9 +171,8 @@ def test_a_bag_that_says_all_itself_needs_no_calibration(tmp_path):
     assert (mount.yaw, mount.pitch) == pytest.approx((0.0, 0.0), abs=1e-6)
     assert (laser.x, laser.y, laser.z) == pytest.approx((1.0, 0.1, 0.55))
     captures = list(recorded.captures())
-    np.testing.assert_allclose(
-        [pose for _, pose in captures], [[0.5 * k, 0.0, 0.0] for k in range(11)], atol=1e-4
-    )
+    wanted = [[0.5 * k, 0.0, 0.0] for k in range(11)]
+    np.testing.assert_allclose([pose for _, pose in captures], wanted, atol=1e-4)
     assert recorded.without_pose == 0
     assert recorded.errors.position > 0.2
     for k, (taken, _) in enumerate(captures[:-1]):
@@ -214,9 +186,8 @@ def test_a_bag_that_says_all_itself_needs_no_calibration(tmp_path):
 
 
 def test_transforms_pairs_and_hanging_sensors(tmp_path):
-    recorded = RecordedDrive(
-        write(tmp_path / "tf", drive(poses="tf", skip=("/lidar",), sides=("left", "right")))
-    )
+    both = write(tmp_path / "tf", drive(poses="tf", skip=("/lidar",), sides=("left", "right")))
+    recorded = RecordedDrive(both)
     np.testing.assert_allclose(recorded.poses[:, 0], 100.0 + 0.5 * np.arange(11))
     ((_, pair, mount),) = recorded.rig.stereo_cameras
     assert (pair.baseline, pair.camera.fx, mount.z) == (pytest.approx(0.5), F, pytest.approx(1.2))
@@ -233,20 +204,11 @@ def test_transforms_pairs_and_hanging_sensors(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"skip": ("/fix", "/imu")},
-            "has no poses, want Pose2D, .*NavSatFix or /tf; it has /left/camera_info",
-        ),
+        ({"skip": ("/fix", "/imu")}, "has no poses, want Pose2D, .*NavSatFix or /tf; it has /left/c"),
         ({"skip": ("/left/camera_info",)}, "has no CameraInfo; describe its sensors: --calibration"),
-        (
-            {"sides": ("front", "rear")},
-            r"has 2 cameras, /front/image_raw \(sensor.*Image\), /rear.*; choose them by `topic`",
-        ),
+        ({"sides": ("front", "rear")}, r"2 cameras, /front/image_raw \(sensor.*Image\), /rear.*; .*`topic`"),
         ({"late": 100}, "ends at .* before .* begins at .*: do their clocks agree"),
-        (
-            {"sides": ("left", "right"), "right_late": 2 * 10**7, "skip": ("/lidar",)},
-            r"same moment .*: 0\.0200 s apart",
-        ),
+        ({"sides": ("left", "right"), "right_late": 2 * 10**7, "skip": ("/lidar",)}, r"moment .*: 0\.0200 s"),
     ],
 )
 def test_what_a_bag_lacks_is_said_in_a_line(tmp_path, options, message):
@@ -283,9 +245,8 @@ def test_a_pair_with_its_own_lenses_is_aligned_by_rows():
         for raw, new, r, t in ((left, one, np.eye(3), np.zeros(3)), (right, other, turn, move)):
             (at,), _ = cv2.projectPoints(np.array([point]), r, t, raw.matrix, np.array(raw.distortion))
             image = np.zeros((240, 320, 3), np.uint8)
-            cv2.circle(
-                image, tuple(int(v) for v in np.rint(at[0] * 16)), 3 * 16, (255, 255, 255), -1, cv2.LINE_AA, 4
-            )
+            middle = tuple(int(v) for v in np.rint(at[0] * 16))
+            cv2.circle(image, middle, 3 * 16, (255, 255, 255), -1, cv2.LINE_AA, 4)
             rows, columns = np.nonzero(new.rectified(image)[..., 0] > 100)
             places.append((columns.mean(), rows.mean()))
         (x, y), (x2, y2) = places
@@ -310,9 +271,8 @@ def test_pictures_of_a_rolled_camera_are_turned_level():
 
 def test_a_scan_of_a_driving_car_is_as_from_where_it_began():
     angles = np.radians(np.arange(-45.0, 45.1, 0.5))
-    moved = np.column_stack(
-        [np.linspace(0.0, 1.0, len(angles)), np.zeros(len(angles)), np.zeros(len(angles))]
-    )
+    moved = np.zeros((len(angles), 3))
+    moved[:, 0] = np.linspace(0.0, 1.0, len(angles))
     ranges = (8.0 - moved[:, 0]) / np.cos(angles)  # a wall 8 m ahead
     scan = Scan(float(angles[0]), math.radians(0.5), 30.0, ranges.astype(np.float32))
     found = without_motion(scan, moved).ranges
@@ -335,9 +295,8 @@ def kitti(folder, rectified=True):
         for camera in ("image_00", "image_01"):
             cv2.imwrite(str(place / camera / f"data/{k:010d}.png"), np.full(size[::-1], 40 * k, np.uint8))
         points = scene(height=1.73)
-        np.column_stack([points, points[:, :1]]).astype("<f4").tofile(
-            place / f"velodyne_points/data/{k:010d}.bin"
-        )
+        file = place / f"velodyne_points/data/{k:010d}.bin"
+        np.column_stack([points, points[:, :1]]).astype("<f4").tofile(file)
         row = np.zeros(30)
         row[[0, 1, 5, 23]] = ll[k, 1], ll[k, 0], math.pi / 2, 0.05
         (place / f"oxts/data/{k:010d}.txt").write_text(" ".join(f"{v:.10f}" for v in row))
@@ -366,9 +325,8 @@ def test_a_raw_folder_of_kitti_is_read_as_it_comes(tmp_path, rectified):
     for path in (place, place.parent):
         recorded = RecordedDrive(path, None, source_of(path, None, options, frame), frame)
         captures = list(recorded.captures())
-        np.testing.assert_allclose(
-            [pose for _, pose in captures], [[0, 2 * k, math.pi / 2] for k in range(6)], atol=1e-5
-        )
+        wanted = [[0, 2 * k, math.pi / 2] for k in range(6)]
+        np.testing.assert_allclose([pose for _, pose in captures], wanted, atol=1e-5)
     ((_, camera, mount),) = recorded.rig.cameras
     assert (camera.width, camera.height, camera.fx, camera.cx) == (WIDTH, HEIGHT, F, 48.0)
     assert (mount.x, mount.y, mount.z) == pytest.approx((1.08, -0.32, 1.65), abs=0.02)
@@ -379,9 +337,7 @@ def test_a_raw_folder_of_kitti_is_read_as_it_comes(tmp_path, rectified):
     assert capture.scans["laser"].min() == pytest.approx(6.0, abs=0.05)
     assert recorded.start % 86_400 == 13 * 3600 + 2 * 60 + 25
     (place.parent / "calib_velo_to_cam.txt").unlink()
-    with pytest.raises(
-        InputError, match=r"has no calib_velo_to_cam\.txt, want KITTI's calibration of that day"
-    ):
+    with pytest.raises(InputError, match=r"has no calib_velo_to_cam\.txt, want KITTI's calibration of"):
         list(RecordedDrive(place, None, source_of(place, None, options, None)).captures())
 
 
@@ -447,10 +403,7 @@ def test_a_folder_of_a_drive_and_its_calibration_file(tmp_path):
     assert (captures[1][0].capture.scans["band"] == 5.0).all()
     pair = FOLDER.replace("[[cameras]]", "[[stereo_cameras]]\ndistortion = [0.1]\nbaseline = 0.5")
     for text, message in (
-        (
-            FOLDER.replace('"points"', '"scans.npz"'),
-            r"scans\.npz: has angle_min, .*, want frame, .*FILE:ARRAY",
-        ),
+        (FOLDER.replace('"points"', '"scans.npz"'), r"scans\.npz: has angle_min, .*, want frame.*:ARRAY"),
         (FOLDER.replace('"points"', '"cloud"'), r"drive: has no folder or file 'cloud'; it has left, points"),
         (
             pair.replace('topic = "left"', 'left = "left"\nright = "left"'),
