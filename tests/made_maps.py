@@ -13,6 +13,7 @@ AISLE = {"highway": "service", "service": "parking_aisle"}
 SERVICE = {"highway": "service"}
 STREET = {"highway": "residential", "name": "Hauptstraße"}
 SPACE = {"amenity": "parking_space"}
+HOUSE_ROWS = (-20, 20, 180, 220, 380, 420)
 
 
 @dataclass
@@ -138,9 +139,6 @@ def one_street(length=100.0, **tags):
     """A street without crossings, and a house."""
     place = Map().way([(0, 0), (length, 0)], {"highway": "residential", **tags})
     return place.box(30, 20, 50, 30, {"building": "house"})
-
-
-HOUSE_ROWS = (-20, 20, 180, 220, 380, 420)
 
 
 def grid(**tags):

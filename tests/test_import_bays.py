@@ -2,6 +2,7 @@
 
 import json
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -47,18 +48,16 @@ def outlines(path, boxes):
         axis = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * (length / 2, width / 2) @ axis
         ring = [[lon, lat] for lat, lon in degrees(np.add(corners, [x, y]))]
-        features.append(
-            {"properties": {"id": 1000 + k}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-        )
+        outline = {"type": "Polygon", "coordinates": [ring]}
+        features.append({"properties": {"id": 1000 + k}, "geometry": outline})
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     return path
 
 
 def cross(tmp_path, **tags):
     """Two streets that cross at (0, 0), and an alley in the north-east."""
-    place = Map().way(
-        [(-200, 0), (0, 0), (120, 0), (200, 0)], {"highway": "residential", "name": "Elm St"}, **tags
-    )
+    elm = {"highway": "residential", "name": "Elm St"}
+    place = Map().way([(-200, 0), (0, 0), (120, 0), (200, 0)], elm, **tags)
     place.way([(0, -200), (0, 0), (0, 200)], {"highway": "residential", "name": "Oak St"})
     place.way([(120, 0), (120, 60)], {"highway": "service"})
     return place.write(tmp_path / "streets.osm")
@@ -113,12 +112,7 @@ def test_meters_become_slots_on_their_side_of_their_street(
 
 def test_outlines_are_slots_as_drawn_and_keep_their_ids(tmp_path):
     """Along the street, across it and at an angle, with their own sizes, entered from the street."""
-    boxes = [
-        (-90, 5, 6.1, 2.2, 2),
-        (-70, -7, 5.2, 2.6, 90),
-        (-60, -7, 5.0, 2.5, 60),
-        (-50, -7, 5.0, 2.5, 120),
-    ]
+    boxes = [(-90, 5, 6.1, 2.2, 2), (-70, -7, 5.2, 2.6, 90), (-60, -7, 5, 2.5, 60), (-50, -7, 5, 2.5, 120)]
     draft = imported(tmp_path, outlines(tmp_path / "bays.geojson", boxes)).draft
     assert dict(zip(draft.slot_ids, draft.slots.mouth.tolist(), strict=True)) == {
         "1000": Mouth.LEFT, "1001": Mouth.REAR, "1002": Mouth.REAR, "1003": Mouth.REAR,
@@ -213,9 +207,8 @@ def test_registers_that_cannot_be_read_say_what_was_wanted(tmp_path):
     far = meters(tmp_path / "far.csv", [(9_000.0, 9_000.0)])
     assert "by overpass-turbo.eu" in refusal(imported, tmp_path, far)
     near = meters(tmp_path / "near.csv", [(60.0, 60.0)])
-    assert "no bay stands at a street of the map (bays without a street within 20 m: 1" in refusal(
-        imported, tmp_path, near
-    )
+    said = refusal(imported, tmp_path, near)
+    assert "no bay stands at a street of the map (bays without a street within 20 m: 1" in said
 
 
 def test_the_command_writes_the_lot_and_what_is_left_out(tmp_path):
@@ -223,29 +216,21 @@ def test_the_command_writes_the_lot_and_what_is_left_out(tmp_path):
     streets, out = cross(tmp_path, oneway="yes"), tmp_path / "lot.geojson"
     said = ran("lot", "import", str(streets), "--bays", str(bays), "--out", str(out))
     assert "9 of 10 bays, 90 %, stand on a street" in said.stdout
-    assert rows_in(tmp_path / "lot.left_out.csv") == [
-        {"reason": "bays without a street within 20 m", "id": "A9"}
-    ]
+    missing = [{"reason": "bays without a street within 20 m", "id": "A9"}]
+    assert rows_in(tmp_path / "lot.left_out.csv") == missing
     lot = read_lot(out)
     assert set(lot.slot_ids) == {f"A{k}" for k in range(9)}
     assert not any(problem.severity == "error" for problem in check_lot(out))
-    assert "--columns wants --bays" in refused(
-        "lot", "import", str(streets), "--columns", "lat=y", "--out", str(out)
-    )
+    assert "--columns wants --bays" in refused("lot import", streets, "--columns", "lat=y", "--out", out)
     beside = ("lot", "import", str(streets), "--bays", str(bays), "--out", str(bays.with_suffix(".geojson")))
     assert f"would replace {bays}, which is read" in refused(*beside)
     assert len(rows_in(bays)) == 10
 
 
 def streets_of(register, out, columns, monkeypatch):
-    sys.path.insert(0, str(ROOT / "examples"))
-    import streets_of_bays
-
-    sys.path.pop(0)
-    monkeypatch.setattr(
-        sys, "argv", ["streets_of_bays.py", str(register), "--out", str(out), "--columns", columns]
-    )
-    streets_of_bays.main()
+    words = ["streets_of_bays.py", str(register), "--out", str(out), "--columns", columns]
+    monkeypatch.setattr(sys, "argv", words)
+    import_module("examples.streets_of_bays").main()
     return import_town(out, bays=register, columns=columns, bays_only=True)
 
 
