@@ -14,14 +14,15 @@ from parkenv.cli.lot import _square
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.town.draft import import_town
 
+TYPED = {"yes": True, "no": False, "9": 9.0}
+
 
 def blocks(tags, at=(100, 0)):
     """Two streets side by side, joined at their ends, with a node on the first one."""
     place = Map().way([(0, 0), (100, 0)], STREET).way([(100, 0), (200, 0)], STREET)
     place.way([(0, 0), (0, 90), (200, 90), (200, 0)], STREET, name="Umweg")
-    place.way([(0, 0), (-90, 0)], STREET).way([(200, 0), (290, 0)], STREET).way(
-        [(100, 0), (100, -90)], STREET
-    )
+    place.way([(0, 0), (-90, 0)], STREET).way([(200, 0), (290, 0)], STREET)
+    place.way([(100, 0), (100, -90)], STREET)
     place.box(150, 20, 160, 30, {"amenity": "parking", "capacity": "9"})
     place.box(60, 20, 80, 30, {"building": "house"})
     return place.node(*at, **tags)
@@ -58,9 +59,6 @@ def one_way_town():
     return place.box(60, 20, 80, 30, {"building": "house"})
 
 
-TYPED = {"yes": True, "no": False, "9": 9.0}
-
-
 def hstore(tags):
     quoted = {key: value.replace('"', '\\"') for key, value in tags.items()}
     return ",".join(f'"{key}"=>"{value}"' for key, value in quoted.items())
@@ -68,21 +66,12 @@ def hstore(tags):
 
 DIALECTS = {
     "typed": lambda f, tags: {"@id": f["id"], **{k: TYPED.get(v, v) for k, v in tags.items()}, "ref": None},
-    "ogr2ogr": lambda f, tags: {
-        "osm_id": f["id"][4:],
-        "highway": tags.pop("highway", None),
-        "other_tags": hstore(tags),
-    },
-    "pyrosm": lambda f, tags: {
-        "id": int(f["id"][4:]),
-        "osm_type": "way",
-        "tags": json.dumps(tags),
-        "name": None,
-    },
+    "ogr2ogr": lambda f, t: {"osm_id": f["id"][4:], "highway": t.pop("highway", None), "other_tags": hstore(t)},
+    "pyrosm": lambda f, tags: {"id": int(f["id"][4:]), "osm_type": "way", "tags": json.dumps(tags), "name": None},
     "osmium": lambda f, tags: {"@type": "way", "@id": int(f["id"][4:]), **tags},
     "osmnx": lambda f, tags: {**tags, "osmid": [3, 4], "oneway": str("oneway" in tags), "lanes": [1, 2]},
     "quickosm": lambda f, tags: {"full_id": "w" + f["id"][4:], "osm_type": "way", **tags},
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("twice", ["no", "areas", "same", "version"])
@@ -108,10 +97,9 @@ def test_exports_are_read_as_they_are_meant_and_each_thing_once(tmp_path, dialec
     town = import_town(path)
     assert [(row["capacity"], row["capacity_from"]) for row in town.facilities] == [(9, "tag")]
     assert [row["name"] for row in town.facilities] == ['P "1"']
-    lot = town.draft.lot()
-    assert sum(np.hypot(*np.diff(lane.points, axis=0).T).sum() for lane in lot.lanes if lane.oneway) == (
-        pytest.approx(200, abs=1)
-    )
+    oneway = [lane.points for lane in town.draft.lot().lanes if lane.oneway]
+    length_m = sum(np.hypot(*np.diff(points, axis=0).T).sum() for points in oneway)
+    assert length_m == pytest.approx(200, abs=1)
 
 
 def overpass(place, *, geometry=False, **more):
@@ -125,10 +113,8 @@ def overpass(place, *, geometry=False, **more):
     for k, (points, tags) in enumerate(place.ways):
         nodes = [number[point] for point in points]
         corners = [{"lat": at[i][1], "lon": at[i][0]} for i in nodes]
-        elements.append(
-            {"type": "way", "id": k + 1, "tags": tags}
-            | ({"geometry": corners} if geometry else {"nodes": nodes})
-        )
+        shape = {"geometry": corners} if geometry else {"nodes": nodes}
+        elements.append({"type": "way", "id": k + 1, "tags": tags} | shape)
     return json.dumps({"version": 0.6, "elements": elements, **more})
 
 
@@ -141,20 +127,16 @@ def test_answers_of_overpass_are_read_with_and_without_geometry(tmp_path):
     xml = re.sub(r"<node [^>]*></node>\n", "", xml)
     path.write_text(xml)
     want = import_town(place.write(tmp_path / "w.osm"))
-    texts = [overpass(place), overpass(place, geometry=True)]
-    for k, text in enumerate(texts):
-        (tmp_path / f"{k}.json").write_text(text)
+    for k, geometry in enumerate((False, True)):
+        (tmp_path / f"{k}.json").write_text(overpass(place, geometry=geometry))
     for other in (path, tmp_path / "0.json", tmp_path / "1.json"):
         town = import_town(other)
-        assert [lane.points.round(2).tolist() for lane in town.draft.lanes] == [
-            lane.points.round(2).tolist() for lane in want.draft.lanes
-        ]
+        ours, wanted = ([lane.points.round(2).tolist() for lane in its.draft.lanes] for its in (town, want))
+        assert ours == wanted
         assert [row["capacity"] for row in town.facilities] == [9]
 
 
-@pytest.mark.parametrize(
-    "remark", ['runtime error: Query timed out in "query"', "runtime error: out of memory"]
-)
+@pytest.mark.parametrize("remark", ['runtime error: timed out in "query"', "runtime error: out of memory"])
 def test_partial_answers_are_refused(tmp_path, remark):
     (tmp_path / "t.json").write_text(overpass(one_way_town(), remark=remark))
     xml = one_way_town().xml().replace("</osm>", f"<remark> {remark} </remark></osm>")
@@ -164,26 +146,20 @@ def test_partial_answers_are_refused(tmp_path, remark):
             import_town(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ("layer", "joined"), [({"bridge": "yes"}, False), ({"layer": "1"}, False), ({}, True)]
-)
-def test_viaducts_do_not_meet_the_street_below(tmp_path, layer, joined):
+@pytest.mark.parametrize(("tags", "meets"), [({"bridge": "yes"}, False), ({"layer": "1"}, False), ({}, True)])
+def test_viaducts_do_not_meet_the_street_below(tmp_path, tags, meets):
     """In XML by the ids of nodes at one position, in GeoJSON by position alone."""
-    place = (
-        Map().way([(0, 0), (100, 0), (200, 0)], STREET).way([(0, 0), (0, 90), (200, 90), (200, 0)], STREET)
-    )
-    place.way([(100.0, 90), (100.0, 1e-5), (100, -90), (0, -90), (0, 0)], STREET, **layer)
-    place.way([(0, 0), (-90, 0)], STREET).way([(200, 0), (290, 0)], STREET).way(
-        [(100, -90), (100, -190)], STREET
-    )
-    place.box(150, 20, 160, 30, {"amenity": "parking", "capacity": "9"}).box(
-        60, 20, 80, 30, {"building": "yes"}
-    )
+    place = Map().way([(0, 0), (100, 0), (200, 0)], STREET)
+    place.way([(0, 0), (0, 90), (200, 90), (200, 0)], STREET)
+    place.way([(100.0, 90), (100.0, 1e-5), (100, -90), (0, -90), (0, 0)], STREET, **tags)
+    place.way([(0, 0), (-90, 0)], STREET).way([(200, 0), (290, 0)], STREET)
+    place.way([(100, -90), (100, -190)], STREET).box(60, 20, 80, 30, {"building": "yes"})
+    place.box(150, 20, 160, 30, {"amenity": "parking", "capacity": "9"})
     (tmp_path / "t.geojson").write_text(place.geojson())
     for path in (place.write(tmp_path / "t.osm"), tmp_path / "t.geojson"):
         town = import_town(path).draft
         one, other = town.frame.to_xy(FREIBURG.to_lonlat([[200, 0], [100, -90]]))
-        assert metres(town.lot(), one, other) == pytest.approx(190 if joined else 390, abs=5)
+        assert metres(town.lot(), one, other) == pytest.approx(190 if meets else 390, abs=5)
 
 
 def test_a_node_in_its_car_park_is_that_car_park(tmp_path):
@@ -197,9 +173,8 @@ def test_a_box_across_the_date_line_is_cut_there(tmp_path):
     path, frame = one_way_town().write(tmp_path / "t.osm"), LocalFrame(180.0, -16.8)
 
     def moved(match):
-        ((lon, lat),) = (
-            frame.to_lonlat(FREIBURG.to_xy([[float(match[2]), float(match[1])]])).round(7).tolist()
-        )
+        there = frame.to_lonlat(FREIBURG.to_xy([[float(match[2]), float(match[1])]]))
+        ((lon, lat),) = there.round(7).tolist()
         return f'lat="{lat}" lon="{lon}"'
 
     path.write_text(re.sub(r'lat="([^"]*)" lon="([^"]*)"', moved, path.read_text()))
@@ -277,6 +252,5 @@ def test_conditions_of_roads_are_listed(tmp_path):
     place = blocks({})
     place.way([(200, 90), (290, 90)], STREET, **{"motor_vehicle:conditional": "no @ (Sa)", "oneway": "no"})
     rows = import_town(place.write(tmp_path / "t.osm")).draft.unread
-    assert [(r.tag, r.value, r.assumed) for r in rows] == [
-        ("motor_vehicle:conditional", "no @ (Sa)", "as without it")
-    ]
+    found = [(row.tag, row.value, row.assumed) for row in rows]
+    assert found == [("motor_vehicle:conditional", "no @ (Sa)", "as without it")]
