@@ -80,9 +80,8 @@ class _PlainView:
             else:
                 color = self._surface(t, point, ray / length, self._normal(t, uv), depth / fx)
             k = self.weather.haze * depth * length
-            color = color + (np.array(self.weather.horizon) - color) * (
-                1.0 - 1.0 / (1.0 + k * (1.0 + 0.5 * k))
-            )
+            fade = 1.0 - 1.0 / (1.0 + k * (1.0 + 0.5 * k))
+            color = color + (np.array(self.weather.horizon) - color) * fade
         pane = seen.pane[y, x]
         if pane >= 0:
             point = self.pose[:3, 3] + ray / float(seen.pane_inverse_depth[y, x])

@@ -47,9 +47,8 @@ def _with_clouds(dome, weather, rng, x, y, z):
     # A layer of clouds at unit height, stretched towards the horizon but not infinitely.
     column = (x / (z + 0.2) * 0.17 * 256) % 256
     row = (y / (z + 0.2) * 0.17 * 256) % 256
-    sheet = cv2.remap(
-        noise, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
-    )
+    at = column.astype(np.float32), row.astype(np.float32)
+    sheet = cv2.remap(noise, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     threshold = np.quantile(noise, 1.0 - weather.clouds) if weather.clouds > 0.0 else 2.0
     cover = np.clip((sheet - threshold + 0.06) * 4.0, 0.0, 1.0)[..., None]
     brightness = 0.75 + 0.5 * np.clip(sheet, 0.0, 1.0)[..., None]

@@ -92,11 +92,8 @@ def test_shading_is_that_of_plain_python(preset):
     maps = light_maps(scene.pool, scene.instances, weather, 8.0, 0.0)
     ground = ground_texture(scene.ground)
     seen = (*camera.visibility(scene, pose), pose, camera.intrinsics, weather, ground, maps)
-    assert set(seen[0].material[np.unique(seen[1].triangle[seen[1].triangle >= 0])]) == {
-        Material.PAINT,
-        Material.FOLIAGE,
-        Material.STONE,
-    }
+    shown = set(seen[0].material[np.unique(seen[1].triangle[seen[1].triangle >= 0])])
+    assert shown == {Material.PAINT, Material.FOLIAGE, Material.STONE}
     assert (seen[1].pane >= 0).mean() > 0.01
     ours, plain = shade(*seen), plain_radiance(*seen)
     off = np.abs(ours - plain) / (plain + 0.1 * plain.mean())

@@ -26,12 +26,7 @@ CAMERA = PinholeCamera.from_field_of_view(horizontal=math.pi / 2)
 def outline(x, y, yaw, length, width, sides):
     """Return points every 5 cm on sides of a rectangle: l, r (flanks), f, b (ends), (k, 2) m."""
     u, v = np.arange(-length / 2, length / 2, 0.05), np.arange(-width / 2, width / 2, 0.05)
-    parts = {
-        "l": u + 0.5j * width,
-        "r": u - 0.5j * width,
-        "f": 0.5 * length + 1j * v,
-        "b": -0.5 * length + 1j * v,
-    }
+    parts = {"l": u + 0.5j * width, "r": u - 0.5j * width, "f": length / 2 + 1j * v, "b": 1j * v - length / 2}
     points = complex(x, y) + np.exp(1j * yaw) * np.concatenate([parts[side] for side in sides])
     return np.column_stack([points.real, points.imag])
 
@@ -44,9 +39,8 @@ def sighting(points, xy, yaw, p, eye):
     )  # fmt: skip
     scan = RangeScan(*eye, np.empty(0), np.empty(0), 40.0)
     boxes = Detections(np.array([[0.0, 0.0, 9.0, 9.0]]), np.float32([p]))
-    return CameraView(
-        "c", CAMERA, Mount(), np.zeros((1, 1, 3), np.uint8), boxes, scan, None, cars, np.array([-1])
-    )
+    picture = np.zeros((1, 1, 3), np.uint8)
+    return CameraView("c", CAMERA, Mount(), picture, boxes, scan, None, cars, np.array([-1]))
 
 
 @settings(max_examples=25, deadline=None)

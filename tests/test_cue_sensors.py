@@ -43,10 +43,8 @@ class Departure:
     def __init__(self, name="mini", key=12345):
         self.scenario, self.key = busy(name), np.uint64(key)
         arrival = self.scenario.occupancy.draw_arrival(self.scenario.arrival, self.key)
-        self.world, self.slots = (
-            self.scenario.occupancy.world(self.key, arrival),
-            np.arange(self.scenario.lot.n_slots),
-        )
+        self.world = self.scenario.occupancy.world(self.key, arrival)
+        self.slots = np.arange(self.scenario.lot.n_slots)
         ends = self.world.next_free(self.slots, arrival.time)
         leads = np.array([shown_s(self.key, s, end, 31.0) for s, end in enumerate(ends)])
         chosen = (leads > 14.0) & (leads < 90.0) & (ends > arrival.time + 130.0)
@@ -129,9 +127,8 @@ def test_somebody_comes_to_the_door_and_is_gone_before_lamps_are_lit():
     scenes, away = leaving.scenes(), []
     for after in (-9.0, -5.0, 0.5):
         scene = scenes.at(leaving.end - leaving.lead + after)
-        away.append(
-            np.hypot(*(scene.movers.walker_pose[:, :2] - scene.vehicle_pose[leaving.slot, :2]).T).min()
-        )
+        gap = scene.movers.walker_pose[:, :2] - scene.vehicle_pose[leaving.slot, :2]
+        away.append(np.hypot(*gap.T).min())
     assert away[0] > away[1] + 1.0 > away[2]
     assert 0.8 < away[2] < 1.8
     scene = scenes.at(leaving.end - 9.0)
@@ -213,9 +210,8 @@ def test_lamps_and_motion_are_evidence_that_a_car_leaves():
         capture = rig.capture(scenes.at(time, pose), pose, Weather.draw("overcast", 3), 0)
         results[left] = pipeline.locate(TimedCapture(time, capture))
     still, lit, moves, out = results.values()
-    rows = [
-        cues.features(pair, np.array([leaving.slot])) for pair in ((still, still), (still, lit), (moves, out))
-    ]
+    pairs = (still, still), (still, lit), (moves, out)
+    rows = [cues.features(pair, np.array([leaving.slot])) for pair in pairs]
     shown = [dict(zip(WEIGHTS, row[0], strict=True)) for row in rows]
     assert shown[0]["picture"] == shown[1]["picture"] == 1.0
     assert shown[0]["red"] == 0.0 < 0.3 < shown[1]["red"]

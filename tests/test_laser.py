@@ -54,10 +54,8 @@ def random_plane(rng, n, n_walls, extent):
 def compare(scanner, plane, pose, exclude=None):
     """Number of beams at an edge; all others agree with the definition."""
     ranges, ids = scanner.scan_with_ids(plane, pose, exclude=exclude)
-    wanted = [
-        laser_reference.scan(scanner, plane, (*pose[:2], pose[2] + turn), exclude=exclude)
-        for turn in (-TURN, 0.0, TURN)
-    ]
+    poses = ((*pose[:2], pose[2] + turn) for turn in (-TURN, 0.0, TURN))
+    wanted = [laser_reference.scan(scanner, plane, turned, exclude=exclude) for turned in poses]
     true = np.array([np.minimum(r, 2 * scanner.max_range) for r, _ in wanted])
     edge = (np.ptp(true, 0) > TOLERANCE_M) | (np.abs(true[1] - scanner.max_range) < TOLERANCE_M)
     error = np.abs(np.minimum(ranges, 2 * scanner.max_range) - true[1])

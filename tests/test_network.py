@@ -1,9 +1,8 @@
 """The agent `network`: symmetry, one size for all lots, masks, parity with PyTorch, files, training."""
 
-import importlib.util
 import itertools
 import json
-from pathlib import Path
+from importlib import import_module
 
 import gymnasium as gym
 import numpy as np
@@ -24,9 +23,8 @@ from planners.network.policy import SHIPPED, NetworkCard, NetworkPolicy
 def random_policy(seed=0, **card):
     """A network with random weights."""
     rng, card = np.random.default_rng(seed), NetworkCard(**card)
-    return NetworkPolicy(
-        card, {name: rng.normal(0.0, 0.2, shape).astype(np.float32) for name, shape in card.shapes().items()}
-    )
+    weights = {name: rng.normal(0.0, 0.2, shape).astype(np.float32) for name, shape in card.shapes().items()}
+    return NetworkPolicy(card, weights)
 
 
 def decisions(agent, scenario, seed, most=60):
@@ -130,11 +128,7 @@ def test_the_look_ahead_knows_the_shortest_drive_and_walk_where_all_slots_are_fr
 def example():
     """The example that trains the network."""
     pytest.importorskip("torch")
-    file = Path(__file__).parents[1] / "examples" / "train_network.py"
-    spec = importlib.util.spec_from_file_location(file.stem, file)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return import_module("examples.train_network")
 
 
 def test_numpy_and_torch_agree(example):

@@ -8,7 +8,7 @@ import zipfile
 import cv2
 import numpy as np
 import pytest
-from command_line import parkenv, ran, rows_in
+from command_line import ran, refused, rows_in, summary_of
 from numba import config, get_num_threads, set_num_threads
 from onnx import TensorProto, helper, numpy_helper
 from onnx import load as load_onnx
@@ -31,6 +31,8 @@ from sim_sensors.vehicles.vehicle import VehicleModel
 
 CARS = [0, 2]
 TOML = "size = [64, 64]\ncars = [0, 2]\n"
+GOOD = Tiny().model().SerializeToString()
+FILE = MODELS / "net.onnx"
 
 
 def photo(width=90, height=50, seed=0):
@@ -55,7 +57,7 @@ def plain_input(image, grey=False):
     return (fed / 255.0).astype(np.float32), (new[0] / width, new[1] / height), (left, top)
 
 
-def plain_detect(tiny, image, threshold, overlap, grey=False):
+def plain_detect(tiny, image, threshold, most, grey=False):
     """What the adapter should find, candidate by candidate: rows left, top, right, bottom, score, by score."""
     fed, (scale_x, scale_y), (left, top) = plain_input(image, grey)
     found = []
@@ -64,19 +66,13 @@ def plain_detect(tiny, image, threshold, overlap, grey=False):
         box = [(x - w / 2 - left) / scale_x, (y - h / 2 - top) / scale_y]
         box += [(x + w / 2 - left) / scale_x, (y + h / 2 - top) / scale_y]
         if score >= threshold and box[2] > box[0] and box[3] > box[1]:
-            found.append([*box, score])
+            found.append(np.array([*box, score]))
     found.sort(key=lambda r: -r[4])
     kept = []
     for one in found:
-        if all(iou(one, other) <= overlap for other in kept):
+        if all(overlap(one, other) <= most for other in kept):
             kept.append(one)
     return np.array(kept)
-
-
-def iou(a, b):
-    wide, high = (min(a[i + 2], b[i + 2]) - max(a[i], b[i]) for i in (0, 1))
-    common = max(wide, 0.0) * max(high, 0.0)
-    return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
 
 
 def test_threads_share_a_network_and_leave_opencv_as_it_was(tmp_path):
@@ -94,10 +90,7 @@ def test_threads_share_a_network_and_leave_opencv_as_it_was(tmp_path):
 
 @pytest.mark.parametrize(
     ("channels", "settings", "threshold", "overlap"),
-    [
-        (1, 'channels = "grey"\n', 0.08, 0.5),
-        (3, "overlap = 0.3\nthreshold = 0.3\n", 0.3, 0.3),
-    ],
+    [(1, 'channels = "grey"\n', 0.08, 0.5), (3, "overlap = 0.3\nthreshold = 0.3\n", 0.3, 0.3)],
 )
 def test_boxes_are_those_of_a_plain_decoding(tmp_path, channels, settings, threshold, overlap):
     tiny = Tiny(channels=channels)
@@ -168,9 +161,6 @@ def unknown_operator():
     return model
 
 
-GOOD = Tiny().model().SerializeToString()
-
-
 @pytest.mark.parametrize(
     ("content", "settings", "message"),
     [
@@ -200,9 +190,7 @@ def test_what_is_no_detector_is_refused_in_a_line(tmp_path, content, settings, m
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "outputs", [["output0"], ["output0", "between"], ["masks", "output0"], ["masks", "between"]]
-)
+@pytest.mark.parametrize("outputs", ["output0", "output0 between", "masks output0", "masks between"])
 def test_one_of_several_outputs_is_read(tmp_path, outputs):
     """The file's size counts, where none is set; rows of mask coefficients are no classes."""
     model = two_outputs()
@@ -210,7 +198,7 @@ def test_one_of_several_outputs_is_read(tmp_path, outputs):
     model.graph.node.append(helper.make_node("Constant", [], ["masks"], value=given))
     model.graph.output.append(helper.make_tensor_value_info("masks", TensorProto.FLOAT, [1, 2, 16, 16]))
     (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
-    (tmp_path / "a.toml").write_text(f'layout = "yolo"\noutputs = {json.dumps(outputs)}\nthreshold = 0.01\n')
+    (tmp_path / "a.toml").write_text(f'layout = "yolo"\noutputs = {outputs.split()}\nthreshold = 0.01\n')
     detector = make_detector(str(tmp_path / "a.onnx"))
     (tmp_path / "b.onnx").write_bytes(GOOD)
     (tmp_path / "b.toml").write_text("cars = [0]\nthreshold = 0.01\n")
@@ -311,27 +299,18 @@ def test_a_network_looks_in_worker_processes_too(tmp_path):
     for jobs in (2, 1):
         out = tmp_path / str(jobs)
         words = "compare --scenario mini --agents first-free -n 2 --occupancy-levels none --no-figures --rig laser"
-        done = parkenv(words, "--detector", file, "--jobs", jobs, "--out", out)
-        assert done.returncode == 0, done.stderr
+        ran(words, "--detector", file, "--jobs", jobs, "--out", out)
         totals.append((out / "episodes.csv").read_text())
         assert detector_version(file) in (out / SETTINGS).read_text()
     assert totals[0] == totals[1]
 
 
 def test_photographs_are_searched_and_scored_with_it(tmp_path):
-    file = Tiny().save(tmp_path / "a.onnx")
     cv2.imwrite(str(tmp_path / "photo.png"), photo())
-    words = ("detect", tmp_path / "photo.png", "--detector", file)
-    done = parkenv(*words, "--threshold", 0.5, "--out", tmp_path / "d")
-    assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "d" / "summary.json").read_text())["rows"]
-    assert rows
-    assert min(row["probability"] for row in rows) >= 0.5
-    refused = parkenv(*words, "--model", "side")
-    assert "excludes --model" in refused.stderr
-
-
-FILE = MODELS / "net.onnx"
+    words = ("detect", tmp_path / "photo.png", "--detector", Tiny().save(tmp_path / "a.onnx"))
+    ran(*words, "--threshold", 0.5, "--out", tmp_path / "d")
+    assert min(row["probability"] for row in summary_of(tmp_path / "d")["rows"]) >= 0.5
+    assert "excludes --model" in refused(*words, "--model", "side")
 
 
 @pytest.fixture(scope="module")
@@ -360,9 +339,9 @@ def street():
 
 
 def overlap(a, b):
-    inner = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
+    inner = np.minimum(a[2:4], b[2:4]) - np.maximum(a[:2], b[:2])
     common = np.clip(inner, 0, None).prod()
-    return common / ((a[2:] - a[:2]).prod() + (b[2:] - b[:2]).prod() - common)
+    return common / ((a[2:4] - a[:2]).prod() + (b[2:4] - b[:2]).prod() - common)
 
 
 def test_the_shipped_file_is_small_and_holds_nothing_but_a_network(net):
@@ -371,10 +350,8 @@ def test_the_shipped_file_is_small_and_holds_nothing_but_a_network(net):
     assert data[:1] != b"\x80"
     assert not zipfile.is_zipfile(str(FILE))
     model = load_onnx(str(FILE))
-    kinds = {node.op_type for node in model.graph.node}
-    assert kinds <= set(
-        "Add Cast Clip Concat Conv Exp GlobalAveragePool Mul Pow Relu Resize Sigmoid Slice Softmax".split()
-    )
+    known = "Add Cast Clip Concat Conv Exp GlobalAveragePool Mul Pow Relu Resize Sigmoid Slice Softmax"
+    assert {node.op_type for node in model.graph.node} <= set(known.split())
     assert all(np.isfinite(numpy_helper.to_array(t)).all() for t in model.graph.initializer)
     card = {p.key: json.loads(p.value) for p in model.metadata_props}
     slope, offset = card["calibration"]
@@ -399,7 +376,6 @@ def test_it_finds_the_cars_of_a_picture_with_windows_around_them_and_a_copy_the_
         if view != View.OBLIQUE:
             assert sure.view[best] == view
             assert sure.end_on[best] == (view == View.END)
-    found = net.detect(street[0])
     side = ~found.end_on
     size = found.regions[:, 2:] - found.regions[:, :2]
     side |= found.boxes[:, 2] - found.boxes[:, 0] > 2.0 * (found.boxes[:, 3] - found.boxes[:, 1])

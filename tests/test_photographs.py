@@ -9,6 +9,7 @@ from parkenv.files.videos import Video, film
 from parkenv.perception.detector import Detections
 
 SIZE = (160, 120)
+BRIGHT = f"{__name__}:Bright"
 
 
 class Bright:
@@ -21,9 +22,6 @@ class Bright:
             return Detections(np.zeros((0, 4)), np.zeros(0))
         box = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
         return Detections(np.array([box], float), np.array([0.9]))
-
-
-BRIGHT = f"{__name__}:Bright"
 
 
 def drawn(k):

@@ -9,21 +9,11 @@ from hypothesis import strategies as st
 
 from parkenv.lots import packaged_lot
 from parkenv.mapping.route import survey_route
+from parkenv.perception import ranging
 from parkenv.perception.box_fit import fit_box
 from parkenv.perception.detector import Detections
-from parkenv.perception.range_scan import disparity, scan_from_laser, scan_from_stereo
-from parkenv.perception.ranging import (
-    beams_between,
-    bearings,
-    car_beams,
-    localize_cars,
-    localize_disparity,
-    localize_median,
-    median_depth,
-    median_distance,
-)
+from parkenv.perception.range_scan import scan_from_laser, scan_from_stereo
 from parkenv.world.lot_scene import slot_lot
-from sim_sensors.ground_truth import View, vehicle_boxes
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.rig import SensorRig, poses_along
 
@@ -88,9 +78,9 @@ def test_the_middle_of_the_image_is_the_beam_to_the_right():
     """Camera along -π/2 of the laser, first beam at -3π/4, steps of a quarter degree: beam 180 points ahead."""
     scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
     box = np.array([[CAMERA.cx - 4.0, 0.0, CAMERA.cx + 4.0, 9.0]], dtype=np.float32)
-    left, right = bearings(CAMERA, EYE, ORIGIN, box)[0]
+    left, right = ranging.bearings(CAMERA, EYE, ORIGIN, box)[0]
     assert left > -math.pi / 2 > right
-    assert beams_between(scan, left, right).tolist() == list(range(178, 183))
+    assert ranging.beams_between(scan, left, right).tolist() == list(range(178, 183))
 
 
 @given(yaw=st.floats(-10, 10), u=st.floats(0, 639), v=st.floats(0, 639))
@@ -98,8 +88,8 @@ def test_beams_of_a_box_are_those_that_the_camera_sees_in_it(yaw, u, v):
     pose = np.array([3.0, -2.0, yaw])
     scan = scan_from_laser(LASER, MOUNT, pose, np.full(LASER.n_beams, 5.0, np.float32))
     left, right = min(u, v), max(u, v)
-    margins = bearings(CAMERA, EYE, pose, np.array([[left, 0.0, right, 9.0]]))[0]
-    beams = beams_between(scan, *margins)
+    margins = ranging.bearings(CAMERA, EYE, pose, np.array([[left, 0.0, right, 9.0]]))[0]
+    beams = ranging.beams_between(scan, *margins)
     column = CAMERA.cx - CAMERA.fx * np.tan(LASER.angles - EYE.yaw)
     ahead = np.abs(LASER.angles - EYE.yaw) < math.pi / 2
     inside = ahead & (column > left + 1e-6) & (column < right - 1e-6)
@@ -110,9 +100,9 @@ def test_beams_of_a_box_are_those_that_the_camera_sees_in_it(yaw, u, v):
 def test_beams_that_pass_the_car_do_not_count():
     """The box is too wide by a half on either side: the median is the wall's, the run the car's."""
     scan = swept((0.0, -4.0, 0.0, 1.8, 2.0), (0.0, -11.0, 0.0, 60.0, 2.0))
-    beams = beams_between(scan, -math.pi / 2 + 0.7, -math.pi / 2 - 0.7)
-    assert median_distance(scan, beams) > 10.0
-    run = car_beams(scan, beams)
+    beams = ranging.beams_between(scan, -math.pi / 2 + 0.7, -math.pi / 2 - 0.7)
+    assert ranging.median_distance(scan, beams) > 10.0
+    run = ranging.car_beams(scan, beams)
     assert np.median(scan.distance[run.beams]) == pytest.approx(3.0, abs=0.1)
     assert run.cut == (False, False)
 
@@ -121,13 +111,13 @@ def test_a_neighbour_at_the_margin_does_not_count_and_a_run_goes_on_where_the_im
     """Something stands a metre nearer, before the car's left edge, and fills a third of the box."""
     scan = swept((0.0, -8.0, 0.0, 1.8, 4.0), (1.6, -4.0, 0.0, 2.0, 2.0))
     left, right = math.atan2(-6.0, 1.6), math.atan2(-6.0, -1.0)
-    run = car_beams(scan, beams_between(scan, left, right))
+    run = ranging.car_beams(scan, ranging.beams_between(scan, left, right))
     assert np.median(scan.distance[run.beams]) == pytest.approx(6.03, abs=0.03)
     assert run.cut == (False, True), "the van hides where the car ends"
     # A run goes on where the image ends.
     scan = swept((0.0, -3.6, 0.0, 4.4, 1.8))
-    inside = beams_between(scan, -math.pi / 2 + 0.2, -math.pi / 2 - 0.2)
-    short, whole = car_beams(scan, inside), car_beams(scan, inside, (True, True))
+    inside = ranging.beams_between(scan, -math.pi / 2 + 0.2, -math.pi / 2 - 0.2)
+    short, whole = ranging.car_beams(scan, inside), ranging.car_beams(scan, inside, (True, True))
     assert set(short.beams) <= set(inside)
     assert set(short.run) == set(whole.beams), "the beams that go on beyond the box are known"
     ends = scan.points(whole.beams[[0, -1]])[:, 0]
@@ -136,11 +126,11 @@ def test_a_neighbour_at_the_margin_does_not_count_and_a_run_goes_on_where_the_im
 
 def test_what_no_beam_meets_has_no_distance():
     scan = scan_from_laser(LASER, MOUNT, ORIGIN, np.full(LASER.n_beams, np.inf, np.float32))
-    beams = beams_between(scan, -1.0, -2.0)
+    beams = ranging.beams_between(scan, -1.0, -2.0)
     assert len(beams)
-    assert math.isnan(median_distance(scan, beams))
-    assert not len(car_beams(scan, beams).beams)
-    for way in (localize_cars, localize_median):
+    assert math.isnan(ranging.median_distance(scan, beams))
+    assert not len(ranging.car_beams(scan, beams).beams)
+    for way in (ranging.localize_cars, ranging.localize_median):
         assert len(way(boxes_of([300, 200, 340, 300]), scan, CAMERA, EYE, ORIGIN)) == 0
 
 
@@ -152,7 +142,7 @@ def test_what_no_beam_meets_has_no_distance():
 def test_what_does_not_stand_on_the_ground_as_cars_do_is_none(top, bottom, stands):
     """The car's face is 4 m away and the eye 1.3 m high, so the ground there is 104 px below the horizon."""
     scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
-    found = localize_cars(boxes_of([180, top, 460, bottom], ends=False), scan, CAMERA, EYE, ORIGIN)
+    found = ranging.localize_cars(boxes_of([180, top, 460, bottom], ends=False), scan, CAMERA, EYE, ORIGIN)
     assert len(found) == stands
 
 
@@ -160,9 +150,9 @@ def test_beams_end_on_the_nearest_car_of_their_boxes():
     """The car behind would stand where the one in front does: its box is not located; of a car alone it is."""
     near, far = (0.0, -5.0, 0.0, 4.0, 2.0), (0.0, -10.0, 0.0, 4.0, 2.0)
     in_front, behind = [160, 200, 480, 345], [245, 215, 395, 290]
-    both = localize_cars(boxes_of(behind, in_front, ends=False), swept(near, far), CAMERA, EYE, ORIGIN)
-    assert both.detection.tolist() == [1]
-    alone = localize_cars(boxes_of(behind, ends=False), swept(far), CAMERA, EYE, ORIGIN)
+    boxes, scan = boxes_of(behind, in_front, ends=False), swept(near, far)
+    assert ranging.localize_cars(boxes, scan, CAMERA, EYE, ORIGIN).detection.tolist() == [1]
+    alone = ranging.localize_cars(boxes_of(behind, ends=False), swept(far), CAMERA, EYE, ORIGIN)
     np.testing.assert_allclose(alone.xy, [[0.0, -10.0]], atol=0.2)
 
 
@@ -207,7 +197,7 @@ def test_fitted_cars_stand_where_the_cars_do(name):
     lot = packaged_lot(name)
     rng = np.random.default_rng(1)
     scene = slot_lot(lot, 1).scene(rng.random(lot.n_slots) < 0.6)
-    off = {localize_cars: [], localize_median: []}
+    off = {ranging.localize_cars: [], ranging.localize_median: []}
     for pose in poses_along(survey_route(lot).path, 8.0):
         scan, found, places = look(scene, pose, rng)
         for k in range(len(found)):
@@ -215,47 +205,11 @@ def test_fitted_cars_stand_where_the_cars_do(name):
             for way, errors in off.items():
                 for x, y, yaw in way(found.select(np.array([k])), scan, CAMERA, EYE, pose).poses:
                     errors.append((np.hypot(x - true[0], y - true[1]), turned_off(yaw, true[2])))
-    fitted, plain = (np.array(off[way]) for way in (localize_cars, localize_median))
+    fitted, plain = (np.array(off[way]) for way in (ranging.localize_cars, ranging.localize_median))
     assert len(fitted) > 25
     assert np.median(fitted[:, 0]) < 0.3 < np.median(plain[:, 0])
     assert (fitted[:, 0] > 1.0).mean() < 0.05 < (plain[:, 0] > 1.0).mean()
     assert np.median(fitted[:, 1]) < math.radians(2) < math.radians(15) < np.median(plain[:, 1])
-
-
-def beside(pose, xy):
-    """How many cars stand on the right, where the cameras look, at 2 to 10 m."""
-    ahead = np.array([np.cos(pose[2]), np.sin(pose[2])])
-    along, away = (xy - pose[:2]) @ ahead, (xy - pose[:2]) @ [ahead[1], -ahead[0]]
-    return np.count_nonzero((away > 2.0) & (away < 10.0) & (np.abs(along) < 0.8 * away))
-
-
-@pytest.mark.slow
-def test_cars_are_placed_from_stereo_alone():
-    """In a row of perpendicular slots and at a kerb, from boxes around what is near."""
-    errors = []
-    for name in ("campus", "street"):
-        lot = packaged_lot(name)
-        scene = slot_lot(lot, 2).scene(np.random.default_rng(2).random(lot.n_slots) < 0.7)
-        way = poses_along(survey_route(lot).path, 3.0)
-        cars = [beside(pose, scene.vehicle_pose[:, :2]) for pose in way]
-        for pose in way[np.argsort(cars, kind="stable")[-14::5]]:
-            pair = SensorRig.stereo().capture(scene, pose).pairs["right"]
-            disparities = disparity(pair, STEREO)
-            boxes = vehicle_boxes(STEREO.camera, scene, STEREO_MOUNT.camera_pose(pose), pair.left)
-            near = (boxes.visible_fraction > 0.6) & (boxes.distance < 10.0) & (boxes.ids <= scene.n_vehicles)
-            found = boxes_of(*boxes.visible_box[near].tolist(), ends=boxes.view[near] != View.SIDE)
-            scan = scan_from_stereo(STEREO, STEREO_MOUNT, pose, disparities)
-            for k, place in enumerate(boxes.ids[near] - 1):
-                one, true = found.select(np.array([k])), scene.vehicle_pose[place]
-                fitted = localize_cars(one, scan, STEREO.camera, STEREO_MOUNT, pose)
-                plain = localize_disparity(one, disparities, STEREO, STEREO_MOUNT, pose)
-                if len(fitted) and len(plain):
-                    ways = [(c.xy[0] - true[:2], turned_off(c.yaw[0], true[2])) for c in (fitted, plain)]
-                    errors.append([(np.hypot(*off), turn) for off, turn in ways])
-    fitted, thesis = np.array(errors).swapaxes(0, 1)
-    assert len(fitted) >= 8
-    assert np.median(fitted[:, 0]) < min(0.6, np.median(thesis[:, 0]))
-    assert np.median(fitted[:, 1]) < math.radians(10) < np.median(thesis[:, 1])
 
 
 def test_stereo_has_the_depth_of_a_wall_and_none_without_a_match():
@@ -266,8 +220,8 @@ def test_stereo_has_the_depth_of_a_wall_and_none_without_a_match():
     assert scan.points(np.arange(len(scan.angle)))[:, 1] == pytest.approx(-6.0, abs=1e-4)
     nothing = np.full((480, 640), np.nan, np.float32)
     box = boxes_of([100, 100, 300, 300])
-    assert math.isnan(median_depth(nothing, box.boxes[0], STEREO))
-    assert len(localize_disparity(box, nothing, STEREO, STEREO_MOUNT, ORIGIN)) == 0
+    assert math.isnan(ranging.median_depth(nothing, box.boxes[0], STEREO))
+    assert len(ranging.localize_disparity(box, nothing, STEREO, STEREO_MOUNT, ORIGIN)) == 0
     scan = scan_from_stereo(STEREO, STEREO_MOUNT, ORIGIN, nothing)
     assert np.isnan(scan.distance).all()
-    assert len(localize_cars(box, scan, STEREO.camera, STEREO_MOUNT, ORIGIN)) == 0
+    assert len(ranging.localize_cars(box, scan, STEREO.camera, STEREO_MOUNT, ORIGIN)) == 0

@@ -16,6 +16,7 @@ from sim_sensors.vehicles.vehicle import COARSE, DETAILED, FOOTPRINT_CORNERS, KN
 
 SEEDS = range(2)
 MIRRORS_M = 0.30  # both, beyond the body's sides
+EVERY_MESH = pytest.mark.parametrize(("body", "level"), list(product(BODIES, (DETAILED, COARSE))))
 
 
 def corners(mesh):
@@ -77,9 +78,6 @@ def test_bodies_and_paints_are_as_common_as_stated():
     assert np.mean(spread < 25) == pytest.approx(neutral, abs=0.05)
     assert sum(p.share for p in PAINTS) == pytest.approx(1.0)
     assert all(sum(c.share for c in group) == pytest.approx(1.0) for group in SIZE_CLASSES.values())
-
-
-EVERY_MESH = pytest.mark.parametrize(("body", "level"), list(product(BODIES, (DETAILED, COARSE))))
 
 
 @EVERY_MESH
