@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,9 +26,8 @@ def drive():
     """Two aisles of `campus`, three quarters of their slots taken: the lot, true poses, and a scan at each."""
     lot = make_scenario("campus").lot
     scene = slot_lot(lot).scene(np.arange(lot.n_slots) % 4 != 1, 3)
-    poses = poses_along(
-        [(-20.0, 16.0), (0.0, 16.0), (0.0, 0.0), (104.0, 0.0), (98.0, 16.0), (0.0, 16.0)], 2.0
-    )
+    corners = [(-20.0, 16.0), (0.0, 16.0), (0.0, 0.0), (104.0, 0.0), (98.0, 16.0), (0.0, 16.0)]
+    poses = poses_along(corners, 2.0)
     rng = np.random.default_rng(0)
     scans = [scan_from_laser(LASER, MOUNT, HERE, LASER.scan(scene.scan_plane, pose, rng)) for pose in poses]
     return lot, poses, scans
@@ -40,10 +40,6 @@ def located(lot, odometry, scans):
 
 def position_error(estimated, poses):
     return np.hypot(*(estimated - poses)[:, :2].T)
-
-
-def heading_error(estimated, poses):
-    return np.abs((estimated - poses)[:, 2] + math.pi) % (2 * math.pi) - math.pi
 
 
 def test_the_drift_of_odometry_is_as_stated():
@@ -74,7 +70,8 @@ def test_matching_undoes_the_drift_and_hardly_worsens_true_poses(drive, drift):
     assert position_error(odometry, poses).max() >= 40 * drift
     assert np.sqrt((position_error(estimated, poses) ** 2).mean()) < 0.1
     assert position_error(estimated, poses).max() < 0.25
-    assert np.degrees(heading_error(estimated, poses).max()) < 0.5
+    turned = ((estimated - poses)[:, 2] + math.pi) % (2 * math.pi) - math.pi
+    assert np.degrees(np.abs(turned).max()) < 0.5
 
 
 def test_a_wrong_start_is_put_right(drive):
@@ -88,9 +85,8 @@ def test_a_wrong_start_is_put_right(drive):
 def test_without_points_the_pose_follows_the_odometry(drive):
     lot, poses, scans = drive
     for distance in (np.inf, np.nan):
-        blind = [
-            RangeScan(0.0, 0.0, s.angle, np.full(len(s.angle), distance), s.max_range) for s in scans[:30]
-        ]
+        made = partial(RangeScan, 0.0, 0.0)
+        blind = [made(s.angle, np.full(len(s.angle), distance), s.max_range) for s in scans[:30]]
         np.testing.assert_allclose(located(lot, poses[:30], blind)[:, :2], poses[:30, :2], atol=1e-9)
     matcher = ScanMatcher(lot)
     np.testing.assert_allclose(matcher.locate(poses[0], []), poses[0])
@@ -110,9 +106,8 @@ def test_moving_cars_do_not_carry_the_pose_along(drive):
 
 def test_a_survey_knows_where_its_car_was():
     noise = PoseNoise(drift=0.05)
-    settings = SurveySettings(
-        every=6.0, weather="overcast", pose_noise=noise, localise="scan-matching", seed=3
-    )
+    options = {"every": 6.0, "weather": "overcast", "pose_noise": noise, "seed": 3}
+    settings = SurveySettings(localise="scan-matching", **options)
     scenario, _ = halves(traffic=Traffic())
     survey = Survey(scenario, settings)
     result = survey.drive(0)
