@@ -5,15 +5,7 @@ import math
 import numpy as np
 
 from parkenv import OccupancyProcess
-from parkenv.compiled.keyed_random import (
-    DAY_STREAM,
-    ENTRY_STREAM,
-    OBSERVATION_STREAM,
-    OCCUPANCY_STREAM,
-    VIEW_STREAM,
-    keyed_uniform,
-    world_key,
-)
+from parkenv.compiled import keyed_random
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.log import weekday_of
@@ -23,8 +15,8 @@ def day_factor(process, key, slot, p):
     """Factor of the odds of a slot with the forecast `p` on the day of the world."""
     if not process.day_error:
         return 1.0
-    radius = math.sqrt(-2.0 * math.log(keyed_uniform(key, DAY_STREAM, 0, 0)))
-    angle = 2.0 * math.pi * keyed_uniform(key, DAY_STREAM, 0, 1)
+    radius = math.sqrt(-2.0 * math.log(keyed_random.keyed_uniform(key, keyed_random.DAY_STREAM, 0, 0)))
+    angle = 2.0 * math.pi * keyed_random.keyed_uniform(key, keyed_random.DAY_STREAM, 0, 1)
     near = 0.0 if process.nearness is None else process.nearness[slot]
     shift = process.day_error.level * radius * math.cos(angle)
     shift += process.day_error.slope * radius * math.sin(angle) * near
@@ -40,7 +32,7 @@ def process_taken(process, key, arrival, slot, time):
     """
     p = process.marginal(arrival)[slot]
     odds = p / (1.0 - p) * day_factor(process, key, slot, p)
-    taken = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < odds / (1.0 + odds)
+    taken = keyed_random.keyed_uniform(key, keyed_random.OCCUPANCY_STREAM, slot, 0) < odds / (1.0 + odds)
     now, sojourn = arrival, 1
     while True:
         factor, profile = (
@@ -48,13 +40,12 @@ def process_taken(process, key, arrival, slot, time):
             if taken
             else (process.arrival_factor[slot], process.arrival_profile)
         )
-        left = -math.log(keyed_uniform(key, OCCUPANCY_STREAM, slot, sojourn))
+        left = -math.log(keyed_random.keyed_uniform(key, keyed_random.OCCUPANCY_STREAM, slot, sojourn))
         while True:  # hour by hour, in which the rate is constant
             rate, hour_ends = factor * profile[int(now // 3600) % 168], (now // 3600 + 1) * 3600
             if not taken:
-                rate *= day_factor(
-                    process, key, slot, process.marginal(max(now // 3600 * 3600.0, arrival))[slot]
-                )
+                since = max(now // 3600 * 3600.0, arrival)
+                rate *= day_factor(process, key, slot, process.marginal(since)[slot])
             if rate * (hour_ends - now) >= left:
                 now += left / rate
                 break
@@ -79,13 +70,15 @@ class ReferenceSearch:
     """One episode: state, `step`, and what the environment should observe and report."""
 
     def __init__(self, scenario, seed, episode=0):
-        self.scenario, self.key = scenario, world_key(seed, episode)
+        self.scenario, self.key = scenario, keyed_random.world_key(seed, episode)
         self.arrival = scenario.occupancy.draw_arrival(scenario.arrival, self.key)
         self.time = self.arrival.time
         entries = scenario.lot.entry_vertices
         if scenario.entry is not None:
             entries = entries[[scenario.entry]]
-        self.vertex = int(entries[int(keyed_uniform(self.key, ENTRY_STREAM, 0, 0) * len(entries))])
+        self.vertex = int(
+            entries[int(keyed_random.keyed_uniform(self.key, keyed_random.ENTRY_STREAM, 0, 0) * len(entries))]
+        )
         known = scenario.forecast(self.arrival)
         self.forecast, self.decay_rate = known.p_occupied, known.decay_rate
         self.day_error = [known.day_error.level, known.day_error.slope]
@@ -162,9 +155,11 @@ class ReferenceSearch:
         for row in rows:
             slot, hit, false_alarm = int(slots[row]), rates.hit[row], rates.false_alarm[row]
             if not self.scenario.sensor_model.perfect:
-                if keyed_uniform(self.key, VIEW_STREAM, slot, 0) >= rates.seen[row]:
+                if keyed_random.keyed_uniform(self.key, keyed_random.VIEW_STREAM, slot, 0) >= rates.seen[row]:
                     continue
-                error = keyed_uniform(self.key, OBSERVATION_STREAM, slot, int(self.time * 1000.0))
+                error = keyed_random.keyed_uniform(
+                    self.key, keyed_random.OBSERVATION_STREAM, slot, int(self.time * 1000.0)
+                )
                 taken = error < (hit if self.taken(slot) else false_alarm)
             else:
                 taken = self.taken(slot)

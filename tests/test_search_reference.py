@@ -9,6 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from search_reference import ReferenceSearch
+from test_supply import FORBIDDEN, GARAGE, town
 
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
@@ -149,9 +150,7 @@ def recorded_scenario():
 
 
 def make_batch(n, scenario, **options):
-    return gym.make_vec(
-        "parkenv/Search-v2", n, vectorization_mode="vector_entry_point", scenario=scenario, **options
-    )
+    return gym.make_vec("parkenv/Search-v2", n, "vector_entry_point", scenario=scenario, **options)
 
 
 def assert_parity(scenarios, observation="full", n=4, steps=150, **changes):
@@ -159,11 +158,9 @@ def assert_parity(scenarios, observation="full", n=4, steps=150, **changes):
 
     Returns the names of the places of the episodes that ended.
     """
-    envs = make_batch(n, scenarios, observation=observation, max_episode_steps=LIMIT, **changes)
-    singles = [
-        gym.make("parkenv/Search-v2", scenario=scenarios, max_episode_steps=LIMIT, **changes)
-        for _ in range(n)
-    ]
+    options = {"max_episode_steps": LIMIT, **changes}
+    envs = make_batch(n, scenarios, observation=observation, **options)
+    singles = [gym.make("parkenv/Search-v2", scenario=scenarios, **options) for _ in range(n)]
     if observation == "local":
         singles = [LocalObservation(env) for env in singles]
     batch, _ = envs.reset(seed=7)
@@ -202,8 +199,11 @@ def assert_parity(scenarios, observation="full", n=4, steps=150, **changes):
 def test_different_lots_in_one_batch(observation):
     mini = make_scenario("mini", sensor_model=SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2))
     foretold = make_scenario("street").replace(prior=Rumour(make_scenario("street").lot.n_slots))
+    garage = dataclasses.replace(GARAGE, known="live", capacity=3)
+    ruled = make_scenario(town(facilities=(garage, town().facilities[1]), zone_rules=FORBIDDEN))
     places = [recorded_scenario(), mini, make_scenario("jam"), foretold]
-    assert set(assert_parity(places, observation, n=8)) == set(range(4))
+    places += [ruled] if observation == "full" else []
+    assert set(assert_parity(places, observation, n=8)) == set(range(len(places)))
 
 
 def test_occupancy_is_the_full_observation_without_what_it_was_computed_from():
@@ -219,9 +219,7 @@ def test_occupancy_is_the_full_observation_without_what_it_was_computed_from():
 
 def test_gymnasium_s_own_batch_of_single_environments_says_the_same():
     ours = make_batch(3, "mini", max_episode_steps=LIMIT)
-    theirs = gym.make_vec(
-        "parkenv/Search-v2", 3, vectorization_mode="sync", scenario="mini", max_episode_steps=LIMIT
-    )
+    theirs = gym.make_vec("parkenv/Search-v2", 3, "sync", scenario="mini", max_episode_steps=LIMIT)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     assert ours.single_observation_space == theirs.single_observation_space
@@ -333,9 +331,7 @@ def test_a_lot_of_thousands_of_slots_touches_only_what_is_near():
         ({}, None),
     ],
 )
-def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environments_and_batches(
-    options, second
-):
+def test_the_caller_of_reset_may_choose_place_entry_and_time_alone_and_in_batches(options, second):
     two_entries = dataclasses.replace(grid_lot(2, 8), entries=np.array([[0.0, 0.0], [30.0, 0.0]]))
     street = Scenario(name="street", lot=two_entries, occupancy=make_scenario(two_entries).occupancy)
     places = [make_scenario("mini"), street, recorded_scenario()]

@@ -35,11 +35,11 @@ from parkenv.world.week import DAY_S
 from planners import make_agent
 from planners.heuristics.policies import POLICIES
 
-GARAGE = Facility(
-    "P1", "garage", "inner", capacity=40, xy=(30.0, 12.0), gate_s=10.0, inside_s=(30.0, 90.0), known="sign"
-)
+GARAGE = Facility("P1", "garage", "inner", 40, (30.0, 12.0), gate_s=10.0, inside_s=(30.0, 90.0), known="sign")
 INNER = Zone("inner", Price(2.0, charged=Hours.parse("Mo-Sa 08:00-20:00")), users=("public", "permit-a"))
 PERMIT = Zone("permit", users=("permit-a",))
+GREEDY = DriverKind(policy=POLICIES["greedy-drive"])
+FORBIDDEN = {"inner": Zone("inner", Price(1.0)), "permit": Zone("permit", users=("permit-a",))}
 
 
 def town(**changes):
@@ -157,13 +157,10 @@ def test_a_price_is_what_counting_minutes_gives(price, begin, stay):
 
 
 def test_prices_by_hours_are_read_back_and_never_two_at_a_time(tmp_path):
-    price = Price.parse(
-        "2 @ Mo-Sa 08:00-12:00; 1234.5678 @ Mo-Sa 12:00-20:00; 3 @ Tu 20:00-21:00; 0 @ Su 09:00-12:00"
-    )
-    write_lot(
-        replace(grid_lot(2, 4), zone_rules={"a": Zone("a", price)}, slot_zone=["a"] * 8),
-        tmp_path / "a.geojson",
-    )
+    by_hours = "2 @ Mo-Sa 08:00-12:00; 1234.5678 @ Mo-Sa 12:00-20:00; 3 @ Tu 20:00-21:00; 0 @ Su 09:00-12:00"
+    price = Price.parse(by_hours)
+    lot = replace(grid_lot(2, 4), zone_rules={"a": Zone("a", price)}, slot_zone=["a"] * 8)
+    write_lot(lot, tmp_path / "a.geojson")
     again = read_lot(tmp_path / "a.geojson").zone_rules["a"].price
     begin = 3600.0 * np.arange(7 * 24)
     np.testing.assert_allclose(again.amount(begin, 5400.0), price.amount(begin, 5400.0), rtol=1e-12)
@@ -178,12 +175,8 @@ def test_prices_by_hours_are_read_back_and_never_two_at_a_time(tmp_path):
 
 def test_who_may_park_where_and_when():
     """The row of a driver is infinite where class, hours or longest stay forbid to park."""
-    loading = Zone(
-        "inner",
-        Price(6.0, charged=Hours.parse("Mo-Fr 08:00-18:00")),
-        Hours.parse("Mo-Sa 06:00-22:00"),
-        3600.0,
-    )
+    charged, hours = map(Hours.parse, ("Mo-Fr 08:00-18:00", "Mo-Sa 06:00-22:00"))
+    loading = Zone("inner", Price(6.0, charged=charged), hours, 3600.0)
     scenario = make_scenario(town(zone_rules={"inner": loading, "permit": PERMIT}))
     assert scenario.lot.zones == ("inner", "other", "permit")
     assert scenario.has_rules
@@ -236,9 +229,6 @@ def test_a_facility_that_no_entry_leads_to_is_named():
     assert [facility.name for facility in kept.facilities] == ["P2"]
     assert kept.left_out[0].ids == ("P1",)
     assert kept.lot().slot_ids[-1] == "P2"
-
-
-GREEDY = DriverKind(policy=POLICIES["greedy-drive"])
 
 
 def garage_alone(**facility):
@@ -315,18 +305,12 @@ def test_cars_may_stand_there_when_the_world_begins():
     assert fleet.counts().sum() == 1
 
 
-FORBIDDEN = {"inner": Zone("inner", Price(1.0)), "permit": Zone("permit", users=("permit-a",))}
-
-
-@pytest.mark.parametrize(
-    "agent", ["first-free", "greedy-drive", "greedy-total", "greedy-goal", "mdp", "belief"]
-)
+@pytest.mark.parametrize("agent", "first-free greedy-drive greedy-total greedy-goal mdp belief".split())
 def test_nobody_parks_where_the_driver_may_not(agent):
     """In fleets with compiled policies and agents in Python, and in single searches."""
     scenario = make_scenario(town(zone_rules=FORBIDDEN))
-    demand = Demand(
-        PoissonArrivals(60.0, 8 * 3600.0, 10 * 3600.0), ExponentialTime(900.0), ConstantTime(600.0)
-    )
+    arrivals = PoissonArrivals(60.0, 8 * 3600.0, 10 * 3600.0)
+    demand = Demand(arrivals, ExponentialTime(900.0), ConstantTime(600.0))
     policy, own = policy_of(AgentSpec(name=agent), scenario)
     fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(policy=policy)])
     driven(fleet, 1, agents=[own])
@@ -420,20 +404,6 @@ def test_a_count_tells_how_full_it_will_be(capacity, age):
         assert p_full(long_run, capacity - 1, capacity, 0.0) == 0.0
         assert p_full(long_run, capacity, capacity, 0.0) == 1.0
         assert p_full(long_run, 0, capacity, 50.0) == pytest.approx(long_run, abs=1e-6)
-
-
-def test_a_batch_knows_what_a_single_search_knows():
-    garage = replace(GARAGE, known="live", capacity=3)
-    scenario = make_scenario(town(facilities=(garage, town().facilities[1]), zone_rules=FORBIDDEN))
-    env = gym.make("parkenv/Search-v2", scenario=scenario)
-    batch = gym.make_vec("parkenv/Search-v2", num_envs=2, scenario=scenario)
-    one, _ = env.reset(seed=3)
-    seen, _ = batch.reset(seed=[3, 4])
-    for action in np.random.default_rng(0).integers(0, 4, 8):
-        for name, value in one.items():
-            np.testing.assert_array_equal(np.ravel(seen[name][0]), np.ravel(value), err_msg=name)
-        one, *_ = env.step(action)
-        seen, *_ = batch.step(np.full(2, action))
 
 
 def first_belief(known, count, delay_s=0.0):
