@@ -1,22 +1,18 @@
 """What parking costs, by zones and slots, for solvers, agents and fleets; the terms of a step add up everywhere."""
 
-import json
 import pickle
 from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from command_line import parkenv as command
-from command_line import rows_in
-from gymnasium.vector import AutoresetMode
+from command_line import ran, rows_in, summary_of
 from small_lots import driven, features, lasting
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, fleet, lot_v0, make_scenario, simulate
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.records import CAR, N_TERMS, SEARCH
 from parkenv.envs.sb3 import SearchVecEnv
-from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.episodes import EpisodeRunner
@@ -31,6 +27,11 @@ from planners import make_agent
 from planners.bounds.oracle import best_slot
 from planners.heuristics import POLICIES
 from planners.routes import DriveRoutes
+
+DEAR_S = 600.0
+SLOT_S, ZONE_S = 15.0, 30.0  # of parking: of the slot itself, and of an hour in its zone
+PRICE_S = SLOT_S + ZONE_S  # of a search, which is for the expected stay of an hour
+LIMIT = 60
 
 
 def zoned(lot, far="", **columns):
@@ -184,9 +185,6 @@ def test_a_scenario_changes_the_rules_of_zones():
             make_scenario({"base": "town", "zones": wrong})
 
 
-DEAR_S = 600.0
-
-
 def empty_lot(lot):
     return lasting(lot, np.zeros(lot.n_slots, bool), said=-0.5)
 
@@ -201,8 +199,7 @@ def priced(lot, cost_s):
 
 
 @pytest.mark.parametrize(
-    "name",
-    "mdp mdp-static mdp-tuned belief oracle greedy-goal greedy-total first-free".split(),
+    "name", "mdp mdp-static mdp-tuned belief oracle greedy-goal greedy-total first-free".split()
 )
 def test_agents_park_elsewhere_where_that_pays(name):
     lot = packaged_lot("mini")
@@ -243,20 +240,14 @@ def test_the_bound_counts_prices():
 def test_a_comparison_shows_what_parking_cost(tmp_path):
     lot = packaged_lot("mini")
     write_lot(priced(lot, np.where(np.arange(lot.n_slots) % 2 == 0, 30.0, 5.0)), tmp_path / "dear.geojson")
-    done = command(
+    done = ran(
         "compare", "--lot", tmp_path / "dear.geojson", "--agents", "mdp,greedy-goal", "--episodes", 5,
         "--day-error", 0, "--occupancy-levels", "none", "--no-figures", "--out", tmp_path / "run",
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
     assert "parking" in done.stdout
-    for row in json.loads((tmp_path / "run" / "summary.json").read_text())["rows"]:
+    for row in summary_of(tmp_path / "run")["rows"]:
         assert 4.0 < row["parking_cost_s"] <= 30.0
         assert row["total_s"] == pytest.approx(sum(row[name] for name in COST_FIELDS))
-
-
-SLOT_S, ZONE_S = 15.0, 30.0  # of parking: of the slot itself, and of an hour in its zone
-PRICE_S = SLOT_S + ZONE_S  # of a search, which is for the expected stay of an hour
-LIMIT = 60
 
 
 @pytest.fixture(scope="module")
@@ -276,11 +267,6 @@ def check_sums(info, parked=True, of_many=False):
         assert info["parked"]
         paid_s = info["parking_cost_s"]
         assert paid_s > SLOT_S if of_many else paid_s == pytest.approx(PRICE_S)
-
-
-def check_step(reward, info):
-    """The terms of a step are its reward."""
-    assert sum(info[name] for name in REWARD_TERMS) == pytest.approx(reward)
 
 
 def tries(mask, rng):
@@ -303,10 +289,9 @@ def test_single_searches(costly, name, options, searches):
         observation, _ = env.reset(seed=seed)
         returned, over, sums = 0.0, False, dict.fromkeys(REWARD_TERMS, 0.0)
         while not over:
-            observation, reward, terminated, truncated, info = env.step(
-                tries(observation["action_mask"], rng)
-            )
-            check_step(reward, info)
+            action = tries(observation["action_mask"], rng)
+            observation, reward, terminated, truncated, info = env.step(action)
+            assert sum(info[name] for name in REWARD_TERMS) == pytest.approx(reward)
             check_sums(info, parked=bool(terminated and info["parked"]))
             returned, over = returned + reward, terminated or truncated
             sums = {term: sums[term] - info[term] for term in REWARD_TERMS}
@@ -317,35 +302,16 @@ def test_single_searches(costly, name, options, searches):
     assert {"drive", "walk", "parking"} <= seen
 
 
-def test_the_batch(costly):
-    envs = ParkSearchVectorEnv(8, costly, max_episode_steps=LIMIT, autoreset_mode=AutoresetMode.SAME_STEP)
-    observations, _ = envs.reset(seed=0)
-    rng, returns, ended = np.random.default_rng(0), np.zeros(8), 0
-    for _ in range(200):
-        actions = np.array([tries(mask, rng) for mask in observations["action_mask"]])
-        observations, rewards, terminated, truncated, infos = envs.step(actions)
-        returns += rewards
-        done = terminated | truncated
-        for i in np.flatnonzero(done):
-            final = {name: infos["final_info"][name][i] for name in METRICS}
-            check_sums(final, parked=bool(final["parked"]))
-            terms = infos["final_info"]
-            assert sum(terms[name][i] for name in REWARD_TERMS) == pytest.approx(rewards[i])
-            assert final["total_s"] == pytest.approx(-returns[i])
-            ended += int(final["parked"])
-        returns[done] = 0.0
-    assert ended > 10
-
-
-def test_stable_baselines3(costly):
+def test_batches_as_stable_baselines3_has_them(costly):
     venv = SearchVecEnv(4, costly, max_episode_steps=LIMIT)
     venv.seed(0)
     venv.reset()
     rng, ended = np.random.default_rng(0), 0
     for _ in range(200):
         actions = np.array([tries(mask, rng) for mask in venv.action_masks()])
-        _, _, done, infos = venv.step(actions)
+        _, rewards, done, infos = venv.step(actions)
         for i in np.flatnonzero(done):
+            assert sum(infos[i][name] for name in REWARD_TERMS) == pytest.approx(rewards[i])
             check_sums(infos[i], parked=infos[i]["parked"])
             assert infos[i]["episode"]["r"] == pytest.approx(-infos[i]["total_s"])
             ended += int(infos[i]["parked"])
