@@ -20,6 +20,7 @@ from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots.generators import grid_lot
 
 DRIVEN = (3, 3, 1, 3, 0, 2)
+INNER = {"states", "envs", "one_by_one", "at_once", "fleet"}
 
 
 def parts(result):
@@ -111,12 +112,8 @@ class Drive:
     """A car that is driven among others, by pedal and wheel."""
 
     def __init__(self):
-        options = {
-            "lot": "campus",
-            "traffic": Traffic(cars=6, pedestrians=8),
-            "laser": True,
-            "obstacle_map": True,
-        }
+        crowd = Traffic(cars=6, pedestrians=8)
+        options = {"lot": "campus", "traffic": crowd, "laser": True, "obstacle_map": True}
         self.env = gym.make("parkenv/Drive-v1", **options).unwrapped
 
     def reset(self, seed):
@@ -177,16 +174,11 @@ def kind(request):
     return KINDS[request.param]
 
 
-INNER = {"states", "envs", "one_by_one", "at_once", "fleet"}
-
-
 def run(world, actions):
     return [parts(world.step(action)) for action in actions]
 
 
-@pytest.mark.parametrize(
-    "twin_of", [copy.copy, copy.deepcopy, lambda world: pickle.loads(pickle.dumps(world))]
-)
+@pytest.mark.parametrize("twin_of", [copy.copy, copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])
 def test_a_copy_goes_on_alone_as_the_original_would(kind, twin_of):
     plain, world = kind(), kind()
     for each in (plain, world):

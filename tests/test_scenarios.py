@@ -1,5 +1,6 @@
 """Scenarios: their files and errors; environments that change place, and trainings with held-out places."""
 
+import itertools
 import json
 from functools import partial
 
@@ -143,10 +144,8 @@ def test_a_base_has_what_a_file_leaves_out(tmp_path):
         "[demand.shoppers]\nstay_s = 60"
     )
     its, town = ScenarioSpec.read(path), scenario_spec("town")
-    changed = ("costs", "arrivals", "demand", "name")
-    assert all(
-        getattr(its, name) == getattr(town, name) for name in type(town).model_fields if name not in changed
-    )
+    kept = set(type(town).model_fields) - {"costs", "arrivals", "demand", "name"}
+    assert all(getattr(its, name) == getattr(town, name) for name in kept)
     assert (its.title, its.costs.give_up_s, its.costs.prices["centre"]) == ("dear", town.costs.give_up_s, 3.0)
     assert its.arrivals == town.arrivals.changed(hours="09:00-10:00")
     shoppers = town.demand["shoppers"].changed(stay_s=60.0)
@@ -157,11 +156,9 @@ def test_a_base_has_what_a_file_leaves_out(tmp_path):
 
 
 def test_logs_and_maps(tmp_path):
-    lines = [f"2016-01-{day}_{hour:02d}.00,{slot},{(slot + hour) % 2}" for day in (12, 13, 14) for hour in range(7, 20)
-             for slot in (1, 2)]  # fmt: skip
-    (tmp_path / "log.csv").write_text(
-        "datetime,slot_id,occupied\n" + "\n".join(lines).replace("_", "T").replace(".", ":")
-    )
+    looks = itertools.product((12, 13, 14), range(7, 20), (1, 2))
+    lines = [f"2016-01-{day}T{hour:02d}:00,{slot},{(slot + hour) % 2}" for day, hour, slot in looks]
+    (tmp_path / "log.csv").write_text("\n".join(["datetime,slot_id,occupied", *lines]))
     mini = packaged_lot("mini")
     pairs = [f"{slot},{1 + i % 2}" for i, slot in enumerate(mini.slot_ids)]
     (tmp_path / "mapping.csv").write_text("slot_id,log_slot_id\n" + "\n".join(pairs))
@@ -352,9 +349,8 @@ def test_a_batch_draws_a_place_at_each_automatic_reset():
     rng = np.random.default_rng(0)
     for _ in range(60):
         places = envs.scenario_index
-        assert envs.scenario_index.tolist() == [
-            scenario_of_episode(20 + i, int(e), 6) for i, e in enumerate(episode)
-        ]
+        drawn = [scenario_of_episode(20 + i, int(e), 6) for i, e in enumerate(episode)]
+        assert places.tolist() == drawn
         observation, _, terminated, truncated, info = envs.step(rng.integers(0, 5, 5))
         assert envs.observation_space.contains(observation)
         done = terminated | truncated

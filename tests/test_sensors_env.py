@@ -30,11 +30,12 @@ from sim_sensors.movers import Movers
 from sim_sensors.rig import LEFT, RIGHT, Mount, SensorRig, poses_along
 
 SMALL = PinholeCamera.from_field_of_view(80, 60)
-SMALL_RIG = SensorRig(
-    cameras=(("right", SMALL, Mount(z=1.1, yaw=RIGHT)),), lasers=(("laser", LaserScanner(), Mount(z=0.5)),)
-)
-LASER_ONLY = SensorRig(lasers=(("laser", LaserScanner(), Mount(z=0.5)),))
+LASERS = (("laser", LaserScanner(), Mount(z=0.5)),)
+SMALL_RIG = SensorRig(cameras=(("right", SMALL, Mount(z=1.1, yaw=RIGHT)),), lasers=LASERS)
+LASER_ONLY = SensorRig(lasers=LASERS)
 BUSY = Traffic(cars=4, pedestrians=6)
+LOT = packaged_lot("mini")
+POSE = np.array([*LOT.vertex_xy[2], LOT.vertex_yaw[2]])
 
 
 def make(**options):
@@ -89,9 +90,8 @@ def test_captures_lie_on_the_edge_just_driven_end_at_the_stop_and_waiting_makes_
         here, n = int(observation["vertex"]), int(observation["count"])
         start, end = lot.vertex_xy[before], lot.vertex_xy[here]
         shares = np.arange(1, n + 1) / n
-        np.testing.assert_allclose(
-            observation["pose"][:n, :2], start + shares[:, None] * (end - start), rtol=0, atol=1e-4
-        )
+        on_edge = start + shares[:, None] * (end - start)
+        np.testing.assert_allclose(observation["pose"][:n, :2], on_edge, rtol=0, atol=1e-4)
         way = np.arctan2(*(end - start)[::-1])
         np.testing.assert_allclose(observation["pose"][: n - 1, 2], way, atol=1e-5)
         if here < lot.n_slots:
@@ -133,14 +133,10 @@ def test_pictures_of_another_width():
             make(picture_width=wrong)
 
 
-def coming_and_going(lot):
-    """Cars that stay five minutes."""
-    return OccupancyProcess.from_demand(np.zeros(lot.n_slots), np.zeros(168), 300.0)
-
-
 def test_scenes_follow_the_world_and_do_not_depend_on_when_one_looks():
     lot = make_scenario("mini").lot
-    scenario = make_scenario("mini", occupancy=coming_and_going(lot))
+    short_stays = OccupancyProcess.from_demand(np.zeros(lot.n_slots), np.zeros(168), 300.0)
+    scenario = make_scenario("mini", occupancy=short_stays)
     slots, key = slot_lot(lot), np.uint64(77)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
 
@@ -235,9 +231,8 @@ def test_movers_are_drawn_scanned_and_numbered_after_the_parked_cars():
     parked = slot_lot(lot).scene(np.ones(lot.n_slots, bool))
     x, y = lot.vertex_xy[0]
     ahead = np.array([[x, y + 4.0, 0.3]])
-    moving = parked.with_movers(
-        Movers(ahead, np.array([2]), np.array([[x + 4.0, y, 0.0]]), np.array([0.2]), np.array([1]))
-    )
+    walker = np.array([[x + 4.0, y, 0.0]]), np.array([0.2]), np.array([1])
+    moving = parked.with_movers(Movers(ahead, np.array([2]), *walker))
     pose = np.array([x, y, 0.0])
     left = Mount(z=1.1, yaw=LEFT).camera_pose(pose)
     camera = PinholeCamera()
@@ -331,20 +326,14 @@ def test_an_environment_is_copied_while_its_window_is_open(monkeypatch):
     twin.close()
 
 
-LOT = packaged_lot("mini")
-POSE = np.array([*LOT.vertex_xy[2], LOT.vertex_yaw[2]])
-
-
 @pytest.fixture(scope="module")
 def scene():
     return slot_lot(LOT).scene(np.arange(LOT.n_slots) % 3 != 0)
 
 
 def small(mount):
-    return SensorRig(
-        cameras=(("camera", PinholeCamera.from_field_of_view(160, 120), mount),),
-        lasers=(("laser", LaserScanner(), Mount(z=0.5)),),
-    )
+    camera = PinholeCamera.from_field_of_view(160, 120)
+    return SensorRig(cameras=(("camera", camera, mount),), lasers=LASERS)
 
 
 def test_mounts_turn_with_the_vehicle():
