@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from chromium import SOCKETS, screen
 from command_line import ran, refused, summary_of
+from test_report import data_of
 from test_search_reference import SENSORS, random_scenario
 from timetable_world import Timetable
 
@@ -27,10 +27,6 @@ SCRIPTS = Path(pages.__file__).parent
 NODE = shutil.which("node")
 
 
-def data_of(page):
-    return json.loads(re.search(r'id="game-data">(.*?)</script>', page.read_text(), re.DOTALL)[1])
-
-
 @pytest.fixture(scope="module")
 def game(tmp_path_factory):
     """The page of three worlds of the lot with ten slots, beside two agents."""
@@ -42,7 +38,7 @@ def game(tmp_path_factory):
 @pytest.fixture(scope="module")
 def scores(game, tmp_path_factory):
     """What the page would save if a person did what the agent `belief` does."""
-    data = data_of(game)
+    data = data_of(game, "game-data")
     worlds = []
     for world in data["worlds"]:
         env = gym.make("parkenv/Search-v2", scenario="mini")
@@ -135,12 +131,8 @@ def test_the_next_changes_of_slots_are_found_to_the_last_bit(kind):
 
 def test_scores_are_a_row_of_a_comparison(scores, tmp_path):
     agents = f"belief,{saved(scores, tmp_path)},oracle"
-    ran(
-        "compare --scenario mini --seed 4 -n 3 --jobs 1 --no-figures --agents",
-        agents,
-        "--out",
-        tmp_path / "out",
-    )
+    words = "compare --scenario mini --seed 4 -n 3 --jobs 1 --no-figures --agents"
+    ran(words, agents, "--out", tmp_path / "out")
     summary = summary_of(tmp_path / "out")
     belief, human, _ = summary["rows"]
     assert human["agent"] == agents.split(",")[1]
@@ -180,10 +172,9 @@ def test_damaged_scores_are_refused(scores, tmp_path, change, field):
 def test_the_page_searches_as_python_does(browser, game):
     screen(browser, 1280, 800)
     browser.get(game.as_uri())
-    searches = random_searches(make_scenario("mini"), [world["seed"] for world in data_of(game)["worlds"]])
-    taken = browser.execute_script(
-        "return arguments[0].map(([w, actions]) => game.take(w, actions))",
-        [[w, its[0]] for w, its in searches],
-    )
+    seeds = [world["seed"] for world in data_of(game, "game-data")["worlds"]]
+    searches = random_searches(make_scenario("mini"), seeds)
+    program = "return arguments[0].map(([w, actions]) => game.take(w, actions))"
+    taken = browser.execute_script(program, [[w, its[0]] for w, its in searches])
     require_equal(searches, taken)
     assert browser.get_log("browser") == []

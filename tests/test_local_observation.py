@@ -158,9 +158,8 @@ def test_it_is_computed_from_observations_alone(sensor):
     """A recorded search gives what a batch computes from the tables of its searches."""
     scenario = make_scenario("mini", sensor_model=sensor)
     env = gym.make("parkenv/Search-v2", scenario=scenario)
-    batch = gym.make_vec(
-        "parkenv/Search-v2", 1, "vector_entry_point", scenario=scenario, observation="local", k=K
-    )
+    options = {"scenario": scenario, "observation": "local", "k": K}
+    batch = gym.make_vec("parkenv/Search-v2", 1, "vector_entry_point", **options)
     rng, over = np.random.default_rng(3), False
     recorded, local = [env.reset(seed=5)[0]], [batch.reset(seed=5)[0]["local"][0]]
     while not over and len(recorded) < 60:

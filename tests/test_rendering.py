@@ -30,18 +30,13 @@ from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 
 def row_lot(vertical=False):
     """Ten slots of 2.5 m by 5 m north of a lane; or east of it, where it runs north."""
-    xy, lane, goal = (
-        np.stack([5.0 + 2.5 * np.arange(10), np.full(10, 5.5)], axis=1),
-        [[0, 0], [35, 0]],
-        (40, 0),
-    )
+    xy = np.stack([5.0 + 2.5 * np.arange(10), np.full(10, 5.5)], axis=1)
+    lane, goals = np.array([[0.0, 0.0], [35.0, 0.0]]), np.array([[40.0, 0.0]])
     turn = slice(None, None, -1 if vertical else 1)
     ids, yaw = tuple(f"A{i}" for i in range(10)), np.full(10, 0.0 if vertical else np.pi / 2)
     size = np.full(10, 5.0), np.full(10, 2.5), np.zeros(10)
-    lanes = (Lane(np.array(lane, float)[:, turn]),)
-    return ParkingLot(
-        "row", ids, xy[:, turn], yaw, *size, lanes, np.zeros((1, 2)), np.array([goal], float)[:, turn]
-    )
+    lanes = (Lane(lane[:, turn]),)
+    return ParkingLot("row", ids, xy[:, turn], yaw, *size, lanes, np.zeros((1, 2)), goals[:, turn])
 
 
 def start(lot, **fields):

@@ -22,12 +22,7 @@ from parkenv.lots import packaged_lot
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.selection import blind_scenario
 from parkenv.studies.simulate import Observer
-from parkenv.studies.trips.driven_car import (
-    NO_ROOM,
-    TAKEN,
-    DrivingStyle,
-    ParkingAttempt,
-)
+from parkenv.studies.trips.driven_car import NO_ROOM, TAKEN, DrivingStyle, ParkingAttempt
 from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv, calibrate
 from parkenv.studies.trips.vehicle_controller import VehicleController
 from parkenv.world.lot_scene import LotScenes
@@ -42,11 +37,9 @@ MINI = make_scenario("mini")
 
 
 @lru_cache
-def searched(name, blind=False, notice_m=2.0):
+def searched(name, blind=False):
     scenario = make_scenario(name)
-    return DrivenSearch(
-        blind_scenario(scenario) if blind else scenario, style=DrivingStyle(notice_m=notice_m)
-    )
+    return DrivenSearch(blind_scenario(scenario) if blind else scenario)
 
 
 class Calling(Observer):
@@ -329,10 +322,9 @@ def test_a_failed_try_takes_longer_the_later_it_is_noticed_and_ends_on_the_lane(
                 break
         result = driver.park(slot, taken=True)
         assert (result.reason, result.slot) == (TAKEN, driver.scenario.lot.slot_ids[slot])
-        assert not driver.car.log.contacts
-        assert result.seconds == pytest.approx(
-            driver.car.time - arrival.time - driver.car.log.legs[0].seconds
-        )
+        log = driver.car.log
+        assert not log.contacts
+        assert result.seconds == pytest.approx(driver.car.time - arrival.time - log.legs[0].seconds)
         pose = driver.vehicle.at_middle(driver.car.state[:3])
         assert abs(abs(pose[1]) - KEPT_RIGHT_M) < 0.4, "back on the lane, which lies along y = 0"
         assert min(abs(math.remainder(pose[2], math.pi)), 1.0) < 0.2
@@ -365,10 +357,7 @@ def test_a_slot_too_narrow_for_the_car_is_left_and_not_sought_again():
     [
         (lambda: DrivingStyle(notice_m=0.3), "notice_m is 0.3, want a number of at least 0.8"),
         (lambda: DrivingStyle(speed=math.nan), "speed is nan, want a finite number"),
-        (
-            lambda: DrivenSearch(MINI, style=DrivingStyle(speed=30.0)),
-            "speed on lanes is 30 m/s, want at most 8",
-        ),
+        (lambda: DrivenSearch(MINI, style=DrivingStyle(speed=30.0)), "lanes is 30 m/s, want at most 8"),
         (lambda: DrivenSearch(MINI, "nobody"), "unknown agent 'nobody'"),
         (lambda: DrivenSearch(MINI, rig="sonar"), "rig is 'sonar', want a SensorRig or one of laser"),
         (lambda: searched("mini").run(-1), "seed is -1"),
