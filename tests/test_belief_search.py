@@ -28,6 +28,12 @@ from planners.belief.agent import WORK_PER_MS
 from planners.belief.best_path import best_path
 from planners.belief.planning_graph import MOST_STOPS
 
+LOTS = range(0, 324, 13)
+"""Thirteen divides none of the rounds of slot chances, pitch, view and shape: they are mixed as in all 324."""
+WRONG = [("belief", "budget_ms", 0.0), ("belief", "doubt", 1.1), ("belief", "event", -0.1)]
+WRONG += [("belief-rivals", "arrivals_per_hour", rate) for rate in (-1.0, np.inf, np.nan)]
+LOT = grid_lot(1, 3, pitch=12.0)
+
 
 def gap(seed, **options):
     """How much longer than the optimum it takes on a random small lot whose map is right, %."""
@@ -35,10 +41,6 @@ def gap(seed, **options):
     best = optimum_s(problem, p.astype(np.float32), entry)
     agent = make_agent("belief", problem, **options)
     return 100.0 * (expected_time(agent, problem, p, entry) / best - 1.0)
-
-
-LOTS = range(0, 324, 13)
-"""Thirteen divides none of the rounds of slot chances, pitch, view and shape: they are mixed as in all 324."""
 
 
 def has_large_trees(seed):
@@ -115,11 +117,8 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong(day_error, ah
 def test_it_looks_at_all_of_a_full_lot_again_and_again():
     """Among slots that differ a little it must not drive to and fro between the likeliest ones."""
     scenario = full_lot(grid_lot(4, 30))
-    env, agent, memory = (
-        gym.make("parkenv/Search-v2", scenario=scenario),
-        make_agent("belief", scenario),
-        None,
-    )
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    agent, memory = make_agent("belief", scenario), None
     observation, _ = env.reset(seed=0)
     path = []
     for _ in range(600):
@@ -201,10 +200,10 @@ def test_it_does_not_circle_among_taken_slots(seed):
     assert search(make_scenario("jam"), seed)["total_s"] < 400.0
 
 
-@pytest.mark.parametrize(("name", "value"), [("budget_ms", 0.0), ("doubt", 1.1), ("event", -0.1)])
-def test_bad_options_are_refused(name, value):
+@pytest.mark.parametrize(("agent", "name", "value"), WRONG)
+def test_bad_options_are_refused(agent, name, value):
     with pytest.raises(InputError, match=f"{name} is {value}"):
-        make_agent("belief", make_scenario("mini"), **{name: value})
+        make_agent(agent, make_scenario("mini"), **{name: value})
 
 
 def hidden_lots(name, seen_rate, occupancy=None):
@@ -230,13 +229,9 @@ def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than
     scenario, kept = at_occupancy(make_scenario("campus"), 0.95), []
     for seed in (5, 11, 17, 23, 29):
         made = choices(scenario, monkeypatch, seed=seed, budget_ms=10.0)
-        kept += [
-            (remaining_s, choice.value.expected_s) for remaining_s, choice in made if remaining_s < np.inf
-        ]
+        kept += [(left_s, choice.value.expected_s) for left_s, choice in made if left_s < np.inf]
         last = [choice.value.remaining_s for _, choice in made]
-        assert all(
-            remaining_s in (last_s, np.inf) for (remaining_s, _), last_s in zip(made[1:], last, strict=False)
-        )
+        assert all(left_s in (last_s, np.inf) for (left_s, _), last_s in zip(made[1:], last, strict=False))
     assert len(kept) > 10
     assert all(expected_s <= remaining_s for remaining_s, expected_s in kept)
 
@@ -255,10 +250,8 @@ def actions(agent, scenario, seed):
 
 def test_without_rivals_it_is_belief_and_equal_seeds_give_equal_actions_in_batches_too():
     scenario = make_scenario("mini")
-    belief, nobody = (
-        make_agent("belief", scenario),
-        make_agent("belief-rivals", scenario, arrivals_per_hour=0),
-    )
+    belief = make_agent("belief", scenario)
+    nobody = make_agent("belief-rivals", scenario, arrivals_per_hour=0)
     for seed in range(3):
         assert actions(belief, scenario, seed) == actions(nobody, scenario, seed)
     agent = make_agent("belief-rivals", scenario)
@@ -315,10 +308,9 @@ def test_rivals_take_the_best_slots_whatever_is_observed_of_one():
         for day in (calm, crowd):
             day.update(belief.observations)
         belief = belief.decay(2.0)
-    assert crowd.p_occupied(belief.time)[5] > calm.p_occupied(belief.time)[5] + 0.05
-    assert crowd.p_occupied(belief.time)[5] > crowd.p_occupied(belief.time)[20], (
-        "the best slots are the rivals'"
-    )
+    p = crowd.p_occupied(belief.time)
+    assert p[5] > calm.p_occupied(belief.time)[5] + 0.05
+    assert p[5] > p[20], "the best slots are the rivals'"
 
 
 def test_drivers_who_know_the_same_make_tours_of_their_own():
@@ -335,12 +327,6 @@ def test_drivers_who_know_the_same_make_tours_of_their_own():
     assert len(tours["belief-rivals"]) >= 4
 
 
-def test_wrong_rates_are_refused():
-    for rate in (-1.0, np.inf, np.nan):
-        with pytest.raises(InputError, match="arrivals_per_hour is"):
-            make_agent("belief-rivals", make_scenario("mini"), arrivals_per_hour=rate)
-
-
 def test_an_experiment_tells_it_the_demand():
     (scenario,) = scenario_specs("mini")
     study = FleetStudy().changed(scenario=scenario)
@@ -350,9 +336,6 @@ def test_an_experiment_tells_it_the_demand():
     sighted = study.changed(sees_cars=True)
     _, (agent, _) = sighted.fleet(Setting("mini", AgentSpec.of("belief-rivals"), "own", 0.0, 120.0))
     assert agent.arrivals_per_hour is None, "it counts the cars that it meets"
-
-
-LOT = grid_lot(1, 3, pitch=12.0)
 
 
 class FromSlot:

@@ -92,11 +92,7 @@ def test_a_full_kerb_is_no_full_district():
     near = nearness(np.arange(60.0))
     before = SlotBelief.of_forecast(np.full(60, 0.7), np.zeros(60), (0.5, 0.0))
     belief = before.update(np.arange(12), np.full(12, True))
-    kerbs = {
-        "one": np.repeat(np.arange(5), 12),
-        "own": np.arange(60),
-        "none": np.full(60, -1),
-    }
+    kerbs = {"one": np.repeat(np.arange(5), 12), "own": np.arange(60), "none": np.full(60, -1)}
     elsewhere = {}
     for name, facility in kerbs.items():
         day = DayBelief(before, near, evidence=independent_share(facility))
@@ -118,19 +114,15 @@ def test_sensor_errors_and_repeated_observations_count_for_what_they_say():
     states = np.array(list(itertools.product((False, True), repeat=3)))
     for h in range(len(weight)):
         posterior[h] = weight[h] * np.prod(np.where(states, p_if[:, h], 1.0 - p_if[:, h]), axis=1)
-    for slots, taken, hit, alarm in (
-        ([0, 1], [True, True], 0.9, 0.2),
-        ([0], [True], 0.7, 0.1),
-        ([1], [False], 0.9, 0.2),
-    ):
+    looks = [([0, 1], [True, True], 0.9, 0.2), ([0], [True], 0.7, 0.1), ([1], [False], 0.9, 0.2)]
+    for slots, taken, hit, alarm in looks:
         belief = belief.decay(5.0).update(slots, taken, hit, alarm)
         day.update(belief.observations)
         for s, said in zip(slots, taken, strict=True):
             chance = np.where(states[:, s], hit, alarm)
             posterior *= chance if said else 1.0 - chance
-    np.testing.assert_allclose(
-        day.p_occupied(belief.time), posterior.sum(axis=0) @ states / posterior.sum(), rtol=1e-9
-    )
+    expected = posterior.sum(axis=0) @ states / posterior.sum()
+    np.testing.assert_allclose(day.p_occupied(belief.time), expected, rtol=1e-9)
 
 
 def test_seen_again_at_once_says_nothing_and_after_long_says_as_much_as_another_slot():
@@ -154,10 +146,8 @@ def test_another_part_of_the_lot_starts_with_what_is_known_of_the_day():
     _, near, whole = forecast_of(80)
     seen = whole.update(np.arange(30), np.ones(30, dtype=bool))
     first, second = np.arange(0, 50), np.arange(20, 80)
-    at_once, old, new = (
-        DayBelief(whole, near, event=0.0),
-        *(DayBelief(whole.take(part), near[part], event=0.0) for part in (first, second)),
-    )
+    at_once = DayBelief(whole, near, event=0.0)
+    old, new = (DayBelief(whole.take(part), near[part], event=0.0) for part in (first, second))
     at_once.update(seen.observations)
     old.update(seen.take(first).observations)
     new.carry_over(old, np.arange(30), np.arange(20, 50))

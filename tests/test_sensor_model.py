@@ -16,12 +16,12 @@ from parkenv.world.sensor_model import SENSOR_MODEL_NAMES
 from planners import make_agent
 
 BANDS = (SensorBand(3.0, True, 0.9, 0.99, 0.01), SensorBand(9.0, True, 0.5, 0.9, 0.2))
+FORMAT = '{"format": "parkenv-sensor-model", "version": '
 
 
 def test_the_nearest_band_that_reaches_holds():
-    rates = SensorModel(12.0, 0.8, 0.3, BANDS).rates(
-        np.array([0.0, 3.0, 3.1, 9.0, 9.1, 1.0]), np.array([1, 1, 1, 1, 1, 0], dtype=bool)
-    )
+    beside = np.array([1, 1, 1, 1, 1, 0], dtype=bool)
+    rates = SensorModel(12.0, 0.8, 0.3, BANDS).rates(np.array([0.0, 3.0, 3.1, 9.0, 9.1, 1.0]), beside)
     assert rates.seen.tolist() == [0.9, 0.9, 0.5, 0.5, 1.0, 1.0]
     assert rates.hit.tolist() == [0.99, 0.99, 0.9, 0.9, 0.8, 0.8]
     assert rates.false_alarm.tolist() == [0.01, 0.01, 0.2, 0.2, 0.3, 0.3]
@@ -40,13 +40,9 @@ def test_files_bring_back_what_was_written_and_say_what_they_are(tmp_path):
         (None, "want a sensor model"),
         ("{", "not JSON"),
         ("[]", "want a sensor model, a JSON object"),
-        ('{"format": "parkenv-sensor-model", "version": 7}', "version is 7, want 1"),
-        ('{"format": "parkenv-sensor-model", "version": 1, "bands": []}', "view_range"),
-        (
-            '{"format": "parkenv-sensor-model", "version": 1, "bands": [], "view_range": 3, "hit_rate": 2, '
-            '"false_alarm_rate": 0}',
-            "hit_rate is 2",
-        ),
+        (FORMAT + "7}", "version is 7, want 1"),
+        (FORMAT + '1, "bands": []}', "view_range"),
+        (FORMAT + '1, "bands": [], "view_range": 3, "hit_rate": 2, "false_alarm_rate": 0}', "hit_rate is 2"),
     ],
 )
 def test_bad_files_are_named(tmp_path, text, message):

@@ -38,12 +38,8 @@ def test_observed_slots_are_free_or_taken_even_where_the_forecast_was_certain():
 
 
 def test_parts_and_observations_keep_the_belief():
-    belief = (
-        SlotBelief.of_forecast([0.2, 0.5, 0.8], np.full(3, 1e-3), (0.5, 0.25))
-        .decay(10.0)
-        .update([2], [True])
-        .decay(5.0)
-    )
+    before = SlotBelief.of_forecast([0.2, 0.5, 0.8], np.full(3, 1e-3), (0.5, 0.25)).decay(10.0)
+    belief = before.update([2], [True]).decay(5.0)
     part = belief.take(np.array([2, 0]))
     assert part.day_error.tolist() == [0.5, 0.25]
     assert (part.age.tolist(), part.observed_taken.tolist()) == ([5.0, np.inf], [True, False])
