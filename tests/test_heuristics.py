@@ -1,12 +1,11 @@
 """Heuristic baselines: agents against a plain reference, compiled policies against agents, to the last bit."""
 
-import dataclasses
 import itertools
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_lots import cut_in_two, small_lot
+from small_lots import cut_in_two, driven, features, small_lot
 
 import parkenv
 from parkenv import OccupancyProcess, Scenario, SearchProblem, SensorBand, SensorModel
@@ -21,9 +20,7 @@ from planners.routes import DriveRoutes
 
 NAMES = ("greedy-goal", "greedy-drive", "greedy-total", "first-free")
 COMPILED = (*NAMES, "usual")
-NOISY = SensorModel(
-    15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
-)
+NOISY = SensorModel(15, bands=(SensorBand(15, True, 0.9, 0.8, 0.1), SensorBand(15, False, 0.8, 0.8, 0.2)))
 
 
 def reference_target(name, problem, routes, belief, vertex, previous):
@@ -149,9 +146,8 @@ def test_usual_heads_for_the_place_of_the_lowest_index():
 def test_usual_tries_every_full_street_once_before_it_gives_up():
     scenario = parkenv.make_scenario("street")
     n = scenario.lot.n_slots
-    forecast, full = (
-        OccupancyProcess.from_demand(np.full(n, level), np.zeros(168), 1800.0) for level in (0.5, 12.0)
-    )
+    worlds = (OccupancyProcess.from_demand(np.full(n, level), np.zeros(168), 1800.0) for level in (0.5, 12.0))
+    forecast, full = worlds
     scenario = scenario.replace(occupancy=full, prior=forecast)
     place = {slot: i for i, run in enumerate(one_way_places(scenario.public())) for slot in run}
     agent, env = make_agent("usual", scenario), gym.make("parkenv/Search-v2", scenario=scenario)
@@ -173,15 +169,12 @@ def test_usual_tries_every_full_street_once_before_it_gives_up():
 def test_nobody_heads_for_a_slot_that_is_not_allowed(name):
     lot = parkenv.make_scenario("campus").lot
     zone = np.where(np.arange(lot.n_slots) % 5 == 0, "open", "permits")
-    fields = {f.name: getattr(lot, f.name) for f in dataclasses.fields(lot) if f.init}
     rules = {"open": Zone("open"), "permits": Zone("permits", users=("permit-a",))}
-    lot = ParkingLot(**{**fields, "slot_zone": zone, "zone_rules": rules})
+    lot = ParkingLot(**features(lot) | {"slot_zone": zone, "zone_rules": rules})
     scenario = parkenv.make_scenario("campus").replace(lot=lot)
     for policy, agents in ((POLICIES[name], None), (None, [make_agent(name, scenario)])):
         fleet = Fleet(scenario, Demand(Headways(8)), background="none", drivers=[DriverKind(policy=policy)])
-        fleet.reset(1)
-        fleet.run(agents)
-        slots = fleet.cars["slot"]
+        slots = driven(fleet, 1, agents=agents).cars["slot"]
         assert (slots >= 0).all()
         assert (slots % 5 == 0).all()
 
@@ -209,9 +202,7 @@ def test_a_compiled_policy_decides_as_its_agent_in_every_situation(name):
         for policy in (POLICIES[name], None):
             fleet = Fleet(scenario, demand, drivers=[DriverKind(policy=policy, **kind)], **options)
             fleet.keep_steps()
-            fleet.reset(seed)
-            fleet.run(None if policy else [make_agent(name, scenario)])
-            runs.append(fleet)
+            runs.append(driven(fleet, seed, agents=None if policy else [make_agent(name, scenario)]))
         compiled, planned = runs
         np.testing.assert_array_equal(compiled.steps, planned.steps)
         for field in ("slot", "state", "ended_at", "n_steps", "failed_parks"):
@@ -226,7 +217,5 @@ def test_a_policy_takes_the_options_of_its_agent():
     slots = []
     for kind, agents in ((DriverKind(policy=agent.compiled_policy()), None), (DriverKind(), [agent])):
         fleet = Fleet(scenario, Demand(Headways(20, 30.0)), drivers=[kind])
-        fleet.reset(3)
-        fleet.run(agents)
-        slots.append(fleet.cars["slot"].tolist())
+        slots.append(driven(fleet, 3, agents=agents).cars["slot"].tolist())
     assert slots[0] == slots[1]

@@ -8,18 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from parkenv.driving import vehicle
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
-from parkenv.driving.vehicle import (
-    ACCELERATION,
-    PHYSICS_S,
-    SPEED,
-    STEERING,
-    VehicleParameters,
-    X,
-    Y,
-    advance,
-    move_along,
-)
 from planners.driving.reeds_shepp import (
     LEFT,
     MOST_WORDS,
@@ -33,12 +23,15 @@ from planners.driving.reeds_shepp import (
 )
 
 poses = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0), st.floats(-math.pi, math.pi)).map(np.array)
+PIECE = st.tuples(st.floats(-2.5, 2.5), st.sampled_from([LEFT, STRAIGHT, RIGHT]))
 ORIGIN = np.zeros(3)
+CAR = vehicle.VehicleParameters()
+commands = st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)), min_size=1, max_size=60)
 
 
 def end_of(lengths, turns, radius=1.0, start=(0.0, 0.0, 0.0)):
     for length, turn in zip(lengths, turns, strict=True):
-        start = move_along(*start, turn / radius, length)
+        start = vehicle.move_along(*start, turn / radius, length)
     return np.array(start)
 
 
@@ -88,11 +81,7 @@ def test_the_way_back_is_as_long_and_so_are_the_mirror_images(start, end):
     assert there >= abs(math.remainder(end[2] - start[2], 2 * math.pi)) - 1e-6
 
 
-@given(
-    pieces=st.lists(
-        st.tuples(st.floats(-2.5, 2.5), st.sampled_from([LEFT, STRAIGHT, RIGHT])), min_size=1, max_size=6
-    )
-)
+@given(pieces=st.lists(PIECE, min_size=1, max_size=6))
 @settings(max_examples=400)
 def test_no_other_way_is_shorter(pieces):
     """Brute force: whatever pieces one drives, the word to the same place is at most as long."""
@@ -119,16 +108,12 @@ def test_changes_of_direction_are_avoided_where_they_cost():
     assert word_cost(np.array([1.0, -1.0, 0.0, 0.0, 0.0]), 2, 2.0, 3.0) == 7.0
 
 
-CAR = VehicleParameters()
-commands = st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)), min_size=1, max_size=60)
-
-
 def drive(car, state, acceleration, steering, steps=1):
     """The states under a constant command, one a step."""
     states = [np.array(state, dtype=float)]
     for _ in range(steps):
         states.append(states[-1].copy())
-        advance(states[-1], acceleration, steering, car.limits)
+        vehicle.advance(states[-1], acceleration, steering, car.limits)
     return np.array(states)
 
 
@@ -145,51 +130,52 @@ def test_the_rear_axle_runs_on_a_circle_of_wheelbase_over_tan_steering(steering,
     angle = side * steering * CAR.max_steering
     radius = CAR.wheelbase / math.tan(angle)
     path = drive(CAR, [0.0, 0.0, 0.0, speed, angle, 0.0], 0.0, side * steering, steps=400)
-    away = np.hypot(path[:, X], path[:, Y] - radius)
+    away = np.hypot(path[:, vehicle.X], path[:, vehicle.Y] - radius)
     np.testing.assert_allclose(away, abs(radius), rtol=1e-9)
-    assert np.allclose(path[:, SPEED], speed)
+    assert np.allclose(path[:, vehicle.SPEED], speed)
 
 
 @given(steering=st.floats(-1.0, 1.0), steps=st.integers(1, 200))
 def test_a_car_at_rest_stays_where_it_is(steering, steps):
     """Turning the wheels moves nothing."""
     path = drive(CAR, np.array([3.0, -2.0, 0.7, 0.0, 0.0, 0.0]), 0.0, steering, steps)
-    assert (path[:, : SPEED + 1] == path[0, : SPEED + 1]).all()
+    assert (path[:, : vehicle.SPEED + 1] == path[0, : vehicle.SPEED + 1]).all()
 
 
 @given(pairs=commands)
 def test_all_limits_and_rates_are_kept(pairs):
     states = driven(pairs)
     change = np.abs(np.diff(states, axis=0))
-    assert np.abs(states[:, STEERING]).max() <= CAR.max_steering
-    assert change[:, STEERING].max() <= CAR.steering_rate * PHYSICS_S + 1e-12
-    assert -CAR.max_reverse_speed <= states[:, SPEED].min() <= states[:, SPEED].max() <= CAR.max_speed
-    assert change[:, SPEED].max() <= CAR.max_braking * PHYSICS_S + 1e-12
-    faster = np.abs(states[1:, SPEED]) > np.abs(states[:-1, SPEED]) + 1e-12
-    assert (change[faster, SPEED] <= CAR.max_acceleration * PHYSICS_S + 1e-12).all()
+    assert np.abs(states[:, vehicle.STEERING]).max() <= CAR.max_steering
+    assert change[:, vehicle.STEERING].max() <= CAR.steering_rate * vehicle.PHYSICS_S + 1e-12
+    speed = states[:, vehicle.SPEED]
+    assert -CAR.max_reverse_speed <= speed.min() <= speed.max() <= CAR.max_speed
+    assert change[:, vehicle.SPEED].max() <= CAR.max_braking * vehicle.PHYSICS_S + 1e-12
+    faster = np.abs(states[1:, vehicle.SPEED]) > np.abs(states[:-1, vehicle.SPEED]) + 1e-12
+    assert (change[faster, vehicle.SPEED] <= CAR.max_acceleration * vehicle.PHYSICS_S + 1e-12).all()
     # Only coming to rest and meeting a limit of the speed end an acceleration at once.
-    held = states[:, ACCELERATION]
+    held = states[:, vehicle.ACCELERATION]
     ended = held[1:] == 0.0
-    assert (np.abs(np.diff(held))[~ended] <= CAR.acceleration_rate * PHYSICS_S + 1e-9).all()
+    assert (np.abs(np.diff(held))[~ended] <= CAR.acceleration_rate * vehicle.PHYSICS_S + 1e-9).all()
 
 
 @given(speed=st.floats(0.01, 8.0) | st.floats(-3.0, -0.01), brake=st.floats(0.05, 1.0))
 def test_brakes_take_energy_bring_the_car_to_rest_and_hold_it(speed, brake):
     path = drive(CAR, [0.0, 0.0, 0.0, speed, 0.0, 0.0], -math.copysign(brake, speed), 0.0, steps=1)
     states = [path[-1]]
-    while states[-1][SPEED] != 0.0:
+    while states[-1][vehicle.SPEED] != 0.0:
         states.append(drive(CAR, states[-1], -math.copysign(brake, speed), 0.0)[-1])
-        assert abs(states[-1][SPEED]) < abs(states[-2][SPEED])
-        assert states[-1][SPEED] * speed >= 0.0
-    assert np.ptp(drive(CAR, states[-1], 0.0, 0.0, steps=10)[:, X]) == 0.0
+        assert abs(states[-1][vehicle.SPEED]) < abs(states[-2][vehicle.SPEED])
+        assert states[-1][vehicle.SPEED] * speed >= 0.0
+    assert np.ptp(drive(CAR, states[-1], 0.0, 0.0, steps=10)[:, vehicle.X]) == 0.0
 
 
 def test_the_way_to_a_halt_is_that_of_constant_braking():
     soft = replace(CAR, acceleration_rate=1e6)
     state = np.array([0.0, 0.0, 0.0, 5.0, 0.0, 0.0])
-    while state[SPEED] > 0.0:
-        advance(state, -1.0, 0.0, soft.limits)
-    assert state[X] == pytest.approx(5.0**2 / (2 * soft.max_braking), rel=1e-12)
+    while state[vehicle.SPEED] > 0.0:
+        vehicle.advance(state, -1.0, 0.0, soft.limits)
+    assert state[vehicle.X] == pytest.approx(5.0**2 / (2 * soft.max_braking), rel=1e-12)
 
 
 @given(pairs=commands, speed=st.floats(-3.0, 3.0))
@@ -203,8 +189,8 @@ def test_an_arc_in_pieces_is_the_same_arc(curvature, way, pieces):
     """Exact integration: the step's length makes no difference."""
     there = (1.0, 2.0, 0.5)
     for _ in range(pieces):
-        there = move_along(*there, curvature, way / pieces)
-    np.testing.assert_allclose(there, move_along(1.0, 2.0, 0.5, curvature, way), atol=1e-12)
+        there = vehicle.move_along(*there, curvature, way / pieces)
+    np.testing.assert_allclose(there, vehicle.move_along(1.0, 2.0, 0.5, curvature, way), atol=1e-12)
 
 
 @given(
@@ -221,12 +207,12 @@ def test_nothing_is_passed_through_at_any_allowed_speed(speed, offset, phase, an
     wall = np.stack([at - 0.05 * along, at + 0.05 * along])
     space = CollisionWorld(CAR, Obstacles.of([(ObstacleKind.WALL, wall)]))
     state = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
-    while state[X] < 20.0:
-        advance(state, 0.0, 0.0, CAR.limits)
+    while state[vehicle.X] < 20.0:
+        vehicle.advance(state, 0.0, 0.0, CAR.limits)
         if space.touched(*state[:3]):
             break
-    assert state[X] + CAR.length - CAR.rear_overhang >= 12.0 - 0.05
-    assert state[X] < 12.5
+    assert state[vehicle.X] + CAR.length - CAR.rear_overhang >= 12.0 - 0.05
+    assert state[vehicle.X] < 12.5
 
 
 @pytest.mark.parametrize("thing", [t for t in ObstacleKind if t is not ObstacleKind.NOTHING])

@@ -180,14 +180,8 @@ class CompiledTimetable(Timetable):
 
 
 def test_a_world_may_bring_compiled_functions():
-    totals = [
-        [row["total_s"] for row in Case(scenario(kind), name).run(range(10))]
-        for kind, name in (
-            (Timetable, "greedy-drive"),
-            (CompiledTimetable, "greedy-drive"),
-            (Timetable, "oracle"),
-        )
-    ]
+    worlds = ((Timetable, "greedy-drive"), (CompiledTimetable, "greedy-drive"), (Timetable, "oracle"))
+    totals = [[row["total_s"] for row in Case(scenario(kind), name).run(range(10))] for kind, name in worlds]
     assert totals[0] == totals[1]
     assert sum(totals[2]) < sum(totals[0])
 
