@@ -15,6 +15,11 @@ from parkenv.studies.fleet.day_replay import town_data
 from parkenv.studies.fleet.tables import BLOCKS, HOURS, LANES, NOWHERE, Blocks
 from parkenv.world.facility import Facility
 
+BLOCKS_OF_RUN = {
+    ("Mill Street", "kerb", "centre", 3), ("P1", "garage", "centre", 2), ("centre", "zone", "centre", 2),
+    ("other", "zone", "other", 5), (NOWHERE, NOWHERE, NOWHERE, 0),
+}  # fmt: skip
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
@@ -35,18 +40,10 @@ def run(tmp_path_factory):
             "commuters": {"arrivals_per_hour": 20, "patience_s": 200},
         },
     }
-    result = fleet(
-        scenarios=[spec], agents=("random",), knows=("own",), days=2, jobs=1, folder=folder / "run"
-    )
+    result = fleet(scenarios=[spec], agents=["random"], knows=["own"], days=2, jobs=1, folder=folder / "run")
     study = result.study
     worlds = [(study.fleet(study.fleet_settings[0]), day) for day in range(2)]
     return result, [driven(world, study.seed, day, agents=agents).cars for (world, agents), day in worlds]
-
-
-BLOCKS_OF_RUN = {
-    ("Mill Street", "kerb", "centre", 3), ("P1", "garage", "centre", 2), ("centre", "zone", "centre", 2),
-    ("other", "zone", "other", 5), (NOWHERE, NOWHERE, NOWHERE, 0),
-}  # fmt: skip
 
 
 def columns(run, table, purpose=ALL):

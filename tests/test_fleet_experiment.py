@@ -29,6 +29,10 @@ from parkenv.studies.results import without_nan
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.study import ExecutionSpec, ReportOptions
 
+HOURS = {"arrivals": {"hours": "08:00-09:00"}, "occupancy": {"typical": {"demand": -0.8}}}
+BEFORE = {"name": "before", "lot": "mini", **HOURS}
+AFTER = {"name": "after", "lot": {"grid": {"rows": 2, "columns": 7}}, **HOURS}
+
 
 def experiment(**changes):
     (scenario,) = scenario_specs("mini")
@@ -109,10 +113,8 @@ def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
         if row["knows"] == "reserve":
             assert (low, row["price_of_anarchy"], high) == (1.0, 1.0, 1.0)
     own, reserve = days[0], days[1]
-    expected = sum(day["total_s"] * day["cars"] for day in own) / sum(
-        day["total_s"] * day["cars"] for day in reserve
-    )
-    assert rows[0]["price_of_anarchy"] == pytest.approx(expected)
+    totals = [sum(day["total_s"] * day["cars"] for day in its) for its in days]
+    assert rows[0]["price_of_anarchy"] == pytest.approx(totals[0] / totals[1])
     assert set(MEASURES) - {"counted_occupancy"} <= rows[0].keys()
     assert rows[0]["difference_s"] == 0.0
     paired = [one["total_s"] - other["total_s"] for one, other in zip(reserve, own, strict=True)]
@@ -169,11 +171,6 @@ def test_an_agent_that_fails_is_named_and_earlier_days_are_kept(tmp_path):
     assert "SystemExit" in message
     assert "leaving:Failing, own, share 0, 3 cars an hour, day" in message
     assert FleetStudy.table.read(out)
-
-
-HOURS = {"arrivals": {"hours": "08:00-09:00"}, "occupancy": {"typical": {"demand": -0.8}}}
-BEFORE = {"name": "before", "lot": "mini", **HOURS}
-AFTER = {"name": "after", "lot": {"grid": {"rows": 2, "columns": 7}}, **HOURS}
 
 
 def study(*scenarios, **changes):
@@ -297,9 +294,8 @@ def test_the_data_replay_the_days_of_the_run(run):
     assert all(day["agrees"] for day in data["fleets"])
     names = ("arrivals_per_hour", "knows", "share")
     settings = [tuple(day[name] for name in names) for day in data["fleets"] if day["day"] == 0]
-    assert settings == [
-        (a, *kind) for a in (20, 40) for kind in (("own", 0), ("reserve", 0.5), ("reserve", 1))
-    ]
+    kinds = (("own", 0), ("reserve", 0.5), ("reserve", 1))
+    assert settings == [(a, *kind) for a in (20, 40) for kind in kinds]
 
 
 def test_cars_drive_along_the_lanes_and_no_slot_holds_two(run):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from small_lots import driven
 
-import parkenv
 from parkenv import OccupancyProcess, Scenario, SensorModel, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.engine.fleet import DriverKind, Fleet
@@ -23,21 +22,22 @@ from parkenv.world.demand import (
     PoissonArrivals,
 )
 from parkenv.world.lot import PARK
-from parkenv.world.scenario import drive_times
 from planners import make_agent
 from planners.heuristics import POLICIES
 from planners.routes import DriveRoutes
 
 LOT = grid_lot(1, 8)
+STEADY = OccupancyProcess.from_demand(np.zeros(8), np.zeros(168))
 SCENARIO = Scenario(
     lot=LOT,
     name="row",
-    occupancy=OccupancyProcess.from_demand(np.zeros(8), np.zeros(168)),
+    occupancy=STEADY,
     v_drive=2.5,
     failure_s=10.0,
     sensor_model=SensorModel(view_range=6.0),
 )
 ROUTES = DriveRoutes(SCENARIO)
+TWO = Demand(ListedArrivals((36000.0, 36060.0)))
 
 
 def toward(slot, vertex):
@@ -138,9 +138,6 @@ def test_a_car_in_a_queue_stands_still_in_pictures():
     hops = np.hypot(*np.diff(np.array(list(at.values())), axis=0).T)
     assert hops.max() <= 0.55 * SCENARIO.v_drive, "it does not jump back"
     assert (hops == 0.0).sum() >= 55, "it waits for half a minute"
-
-
-TWO = Demand(ListedArrivals((36000.0, 36060.0)))
 
 
 def second_arrives(fleet, seed=0):
@@ -269,11 +266,3 @@ def test_a_full_lot_is_left_at_once_or_searched_until_patience_ends(knows):
         assert ((names == "parked").sum(), without.sum()) == (n, 25 - n)
         searched[leave] = (fleet.cars["ended_at"] - fleet.cars["arrival"])[without].mean()
     assert searched[True] < 300.0 <= searched[False]
-
-
-def test_drive_times_are_those_of_the_routes_of_agents():
-    from planners.routes import DriveRoutes
-
-    scenario = parkenv.make_scenario("campus")
-    expected = DriveRoutes(scenario).seconds_from(100)[: scenario.lot.n_slots]
-    np.testing.assert_allclose(drive_times(scenario, 100), expected)

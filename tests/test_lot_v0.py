@@ -6,14 +6,7 @@ import sys
 import numpy as np
 import pytest
 from gymnasium.error import DependencyNotInstalled
-from pettingzoo.test import (
-    api_test,
-    max_cycles_test,
-    parallel_api_test,
-    parallel_seed_test,
-    render_test,
-    seed_test,
-)
+from pettingzoo import test
 
 from parkenv import InputError, OccupancyProcess, Scenario, lot_v0
 from parkenv.lots import grid_lot
@@ -34,19 +27,19 @@ ALL = {"knows": "full", "sees_cars": True, "cues": Cues(), "manoeuvre_s": 5.0}
 
 @pytest.mark.parametrize("options", [{}, ALL])
 def test_pettingzoo_s_tests_of_interface_and_seeds(options):
-    api_test(lot_v0.env(cars=3, **options), num_cycles=40)
-    parallel_api_test(lot_v0.parallel_env(cars=3, tick_s=5.0, **options), num_cycles=100)
-    seed_test(lambda: lot_v0.env(cars=3, **options), num_cycles=20)
-    parallel_seed_test(lambda: lot_v0.parallel_env(cars=3, **options), num_cycles=20)
+    test.api_test(lot_v0.env(cars=3, **options), num_cycles=40)
+    test.parallel_api_test(lot_v0.parallel_env(cars=3, tick_s=5.0, **options), num_cycles=100)
+    test.seed_test(lambda: lot_v0.env(cars=3, **options), num_cycles=20)
+    test.parallel_seed_test(lambda: lot_v0.parallel_env(cars=3, **options), num_cycles=20)
 
 
 def test_pettingzoo_s_tests_of_pictures_and_max_cycles(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    render_test(lot_v0.env)
+    test.render_test(lot_v0.env)
     environment = lot_v0.parallel_env(render_mode="rgb_array")
     environment.reset(seed=0)
     assert environment.render().shape == (480, 640, 3)
-    max_cycles_test(lot_v0)
+    test.max_cycles_test(lot_v0)
 
 
 def aec_run(environment, seed, policy):
@@ -90,15 +83,11 @@ def assert_alike(one, other):
                 np.testing.assert_array_equal(observed[key], also_observed[key], strict=True)
 
 
-def scenario_in_whole_seconds():
-    """Every drive, failed attempt and arrival takes a multiple of an eighth of a second."""
-    lot = grid_lot(2, 6)
-    process = OccupancyProcess.from_demand(np.full(lot.n_slots, 1.0), np.zeros(168), 60.0)
-    return Scenario(lot=lot, name="grid", occupancy=process, v_drive=2.0, failure_s=3.0, wait_s=1.0)
-
-
 def test_both_forms_are_alike_where_ticks_divide_all_times():
-    scenario = scenario_in_whole_seconds()
+    """Every drive, failed attempt and arrival takes a multiple of an eighth of a second."""
+    process = OccupancyProcess.from_demand(np.full(12, 1.0), np.zeros(168), 60.0)
+    times = {"v_drive": 2.0, "failure_s": 3.0, "wait_s": 1.0}
+    scenario = Scenario(lot=grid_lot(2, 6), name="grid", occupancy=process, **times)
     arrivals = ListedArrivals((36000.0, 36000.0, 36003.0, 36005.5, 36030.0))
     demand = Demand(arrivals, stay=ConstantTime(20.0))
     options = {"scenario": scenario, "demand": demand, "max_cycles": 100_000}

@@ -50,6 +50,9 @@ RESIDENTS = Demand(
     NoArrivals(WINDOW[0]), ExponentialTime(7200.0), name="residents", classes={"permit-a": 1.0},
     walks_back=True, parked=400,
 )  # fmt: skip
+TUESDAY = ArrivalDay(1)
+MORNING = ArrivalWindow((1,), 7 * 3600.0, 14.5 * 3600.0)
+TIMES = 86400.0 + np.arange(7 * 3600.0 + 300.0, 14.5 * 3600.0 + 1.0, 300.0)
 
 
 def drawn(demand, episode=0):
@@ -112,11 +115,8 @@ def expected(per_hour, stay):
 def test_the_longest_stay_that_follows_is_taken():
     falls = np.array([100.0] * 6 + [100.0 * 0.5**k for k in range(7)])  # halves in an hour
     steady = np.full(13, 100.0)
-    assert (
-        follow_counts(100.0, falls, *WINDOW).stay.mean_s
-        < follow_counts(100.0, steady, *WINDOW).stay.mean_s
-        == 24 * 3600.0
-    )
+    short_s, long_s = (follow_counts(100.0, cars, *WINDOW).stay.mean_s for cars in (falls, steady))
+    assert short_s < long_s == 24 * 3600.0
     with_gap = np.where(np.arange(13) == 4, np.nan, steady)
     assert_allclose(follow_counts(100.0, with_gap, *WINDOW).expected, 100.0, rtol=0.05)
 
@@ -210,9 +210,8 @@ def test_recorded_days_are_the_world_of_single_searches(tmp_path):
     searched = make_scenario(spec.changed(occupancy={"log": str(log), "mapping": "same"}))
     earlier = make_scenario(spec.changed(occupancy="typical"))
     assert searched.occupancy.recorded
-    fleet = Fleet(
-        earlier, earlier.demand, drivers=[DriverKind(policy=POLICIES["usual"])], leave_full_lot=False
-    )
+    usual = DriverKind(policy=POLICIES["usual"])
+    fleet = Fleet(earlier, earlier.demand, drivers=[usual], leave_full_lot=False)
     record_days(spec, log, **how)
     searched = make_scenario(spec.changed(occupancy={"log": str(log), "mapping": "same"}))
     fleet.reset(0, 0)
@@ -249,11 +248,6 @@ def test_a_parked_car_passes_no_garage_that_has_room():
     assert np.count_nonzero(parked_at == garage) >= 20
 
 
-TUESDAY = ArrivalDay(1)
-MORNING = ArrivalWindow((1,), 7 * 3600.0, 14.5 * 3600.0)
-TIMES = 86400.0 + np.arange(7 * 3600.0 + 300.0, 14.5 * 3600.0 + 1.0, 300.0)
-
-
 def steady(occupied, stay_s, n=50):
     odds = occupied / (1.0 - occupied)
     return OccupancyProcess(np.ones(n), np.full(168, odds / stay_s), np.ones(n), np.full(168, 1.0 / stay_s))
@@ -279,11 +273,9 @@ def test_the_course_of_a_process_is_the_mean_of_its_worlds():
     process = process_of_curve(np.linspace(-1.0, 1.0, 40), 0.5 + 0.3 * np.sin(np.arange(24.0)), 5400.0)
     process = process.with_day_error(DayError(0.7))
     arrival = Arrival(TIMES[0])
-    exact, sampled = (
-        kind.course(process, arrival, TIMES[::12]) for kind in (OccupancyProcess, OccupancyModel)
-    )
+    exact, mean = (kind.course(process, arrival, TIMES[::12]) for kind in (OccupancyProcess, OccupancyModel))
     assert exact.residents[0] == exact.occupied[0]
-    np.testing.assert_allclose(sampled, exact, atol=0.05)
+    np.testing.assert_allclose(mean, exact, atol=0.05)
 
 
 @settings(max_examples=12)

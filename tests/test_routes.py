@@ -11,6 +11,7 @@ from parkenv import InputError, Lane, ParkingLot, make_scenario
 from parkenv.lots import city_lot, grid_lot, packaged_lot
 from parkenv.studies.compare.cases import at_occupancy
 from parkenv.studies.episodes import EpisodeRunner
+from parkenv.world.scenario import drive_times
 from planners import make_agent
 from planners.neighborhood import Neighborhoods
 from planners.routes import DriveRoutes
@@ -30,6 +31,7 @@ def test_drive_times_and_ways_are_those_of_scipy(drives):
     scenario, routes, seconds = drives
     for vertex in range(0, scenario.lot.n_vertices, 7):
         np.testing.assert_allclose(routes.seconds_from(vertex), seconds[vertex], rtol=1e-12)
+        np.testing.assert_allclose(drive_times(scenario, vertex), seconds[vertex, : scenario.lot.n_slots])
     rng = np.random.default_rng(0)
     for _ in range(100):
         vertex, target = rng.integers(scenario.lot.n_vertices, size=2)
@@ -55,17 +57,13 @@ def test_the_nearest_are_all_that_are_as_near(seed, chance):
     np.testing.assert_array_equal(found, np.flatnonzero(np.isfinite(seconds) & (seconds == seconds.min())))
 
 
-def one_way_past_two_slots():
-    """The entry lies between the slots: the first cannot be driven to."""
+def test_what_no_way_leads_to_is_left_out():
+    """The entry to a one-way lane lies between its slots: the first cannot be driven to."""
     lane = Lane(np.array([[0.0, 0.0], [20.0, 0.0], [40.0, 0.0]]), oneway=True)
-    return ParkingLot(
+    lot = ParkingLot(
         "one way", ("before", "after"), [[10.0, -5.0], [30.0, -5.0]], [-np.pi / 2] * 2, [5.0] * 2, [2.5] * 2,
         [0, 0], [lane], entries=[[20.0, 0.0]], goals=[[0.0, -10.0]],
     )  # fmt: skip
-
-
-def test_what_no_way_leads_to_is_left_out():
-    lot = one_way_past_two_slots()
     scenario = make_scenario(lot)
     routes, entry = DriveRoutes(scenario), int(lot.entry_vertices[0])
     assert routes.nearest(entry, np.array([True, False]))[1] == np.inf
