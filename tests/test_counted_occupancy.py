@@ -22,18 +22,14 @@ from parkenv.world.occupancy.process import Arrival
 N = 120
 ATTRACTION = 1.6 * np.linspace(1.0, -1.0, N) + np.random.default_rng(4).normal(0.0, 0.6, N)
 MONDAY, TUESDAY = "2024-01-01", "2024-01-02"
+DAY = "2024-01-29"
 
 
 def counted(**changes):
     """Two equal days whose forecast is right in the mean and wrong by 0.8 logits."""
     curves = np.stack([CURVE, CURVE])
-    arguments = {
-        "days": (MONDAY, TUESDAY),
-        "occupied": curves,
-        "level": logit(curves),
-        "attraction": ATTRACTION,
-    }
-    return CountedOccupancy(**arguments | {"level_sd": np.full((2, 24), 0.8)} | changes)
+    its = {"days": (MONDAY, TUESDAY), "occupied": curves, "level": logit(curves), "attraction": ATTRACTION}
+    return CountedOccupancy(**its | {"level_sd": np.full((2, 24), 0.8)} | changes)
 
 
 @settings(max_examples=25)
@@ -152,9 +148,6 @@ def test_every_car_park_is_a_scenario(tmp_path):
     assert [row["scenario"] for row in rows] == ["mini P0", "mini P1"]
 
 
-DAY = "2024-01-29"
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -176,9 +169,8 @@ def test_a_saturday_as_usual_needs_times_free_places_and_their_number_only(tmp_p
     begin = datetime(2024, 5, 1)
     hours = [begin + timedelta(hours=h) for h in range(24 * 28)]
     full = [0.9 if time.weekday() == 5 and 9 <= time.hour < 18 else 0.3 for time in hours]
-    lines = [
-        f"{time:%d.%m.%Y %H:%M};{120 * (1 - share):.0f}" for time, share in zip(hours, full, strict=True)
-    ]
+    shares = zip(hours, full, strict=True)
+    lines = [f"{time:%d.%m.%Y %H:%M};{120 * (1 - share):.0f}" for time, share in shares]
     table.write_text("\n".join(["Zeit;frei", *lines]), encoding="utf-8")
     words = ("compare", "--scenario", "mini", "--occupancy", table, "--days", "sat", "--hours", "11:00-15:00")
     words += ("--agents", "first-free,belief", "-n", 3, "--jobs", 1, "--out", tmp_path / "out")
@@ -193,9 +185,8 @@ def test_percentages_and_cleaned_readings_are_told(tmp_path):
     hours = [datetime(2024, 5, 1) + timedelta(hours=h) for h in range(24 * 7)]
     share = [100 if 9 <= time.hour < 18 else 30 for time in hours]
     lines = [f"{time:%d.%m.%Y %H:%M};{part}" for time, part in zip(hours, share, strict=True)]
-    (tmp_path / "belegt.csv").write_text(
-        "\n".join(["Zeit;belegt", *lines, "01.05.2024 12:00;-3"]), encoding="utf-8"
-    )
+    text = "\n".join(["Zeit;belegt", *lines, "01.05.2024 12:00;-3"])
+    (tmp_path / "belegt.csv").write_text(text, encoding="utf-8")
     for capacity, warned in ((120, True), (100, False)):
         occupancy = {"counts": {"file": str(tmp_path / "belegt.csv"), "capacity": capacity}}
         spec = ScenarioSpec.parse({"name": "c", "lot": "mini", "occupancy": occupancy}, "test")

@@ -1,6 +1,5 @@
 """Counts of car parks: their faults, each cleaned and counted."""
 
-import json
 from datetime import UTC, date, datetime, timedelta, timezone
 from pathlib import Path
 from zoneinfo import ZoneInfo
@@ -8,7 +7,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pytest
 from car_park_counts import write_counts
-from command_line import parkenv, ran, refused, summary_of
+from command_line import ran, refused, summary_of
 from scipy.special import logit
 
 from parkenv import InputError
@@ -19,6 +18,7 @@ from parkenv.forecast.typical_week_fit import usual_days
 
 CAPACITY = 200
 FIRST = date(2024, 3, 1)
+KEYS = ("model", "log_loss", "brier", "crps", "coverage_90", "days", "car_parks")
 
 
 def free_places(days=60, rng=None):
@@ -156,11 +156,9 @@ def test_the_last_reading_of_an_hour_counts_in_any_order(tmp_path, order):
     rows = [f"a,100,{m.astimezone(zones[i % 3]).isoformat()},{5 + i % 90}" for i, m in enumerate(moments)]
     rows.append(rows[-1].rsplit(",", 1)[0] + ",7")
     wanted = read(tmp_path, rows, timezone="Europe/Berlin")
-    changed = (
-        rows[::-1]
-        if order == "newest first"
-        else [*np.random.default_rng(0).permutation(rows[:-2]), *rows[-2:]]
-    )
+    changed = rows[::-1]
+    if order == "shuffled":
+        changed = [*np.random.default_rng(0).permutation(rows[:-2]), *rows[-2:]]
     counts = read(tmp_path, changed, timezone="Europe/Berlin")
     np.testing.assert_array_equal(counts.occupied, wanted.occupied)
     assert counts.faults == wanted.faults
@@ -224,15 +222,9 @@ DIALECTS = {
 def test_tables_of_times_and_places_are_read_with_a_capacity(tmp_path, header, row):
     """A reading at a time holds for the end of the hour before it."""
     free = free_places(3)
-    rows = [
-        row.format(
-            datetime(2024, 3, 1) + timedelta(days=d, hours=h + 1),
-            free=free[d, h],
-            taken=CAPACITY - free[d, h],
-        )
-        for d in range(3)
-        for h in range(24)
-    ]
+    ends = [datetime(2024, 3, 1) + timedelta(hours=hour + 1) for hour in range(free.size)]
+    places = zip(ends, free.ravel(), strict=True)
+    rows = [row.format(end, free=place, taken=CAPACITY - place) for end, place in places]
     counts = read(tmp_path, rows, header, capacity=CAPACITY)
     assert counts.car_parks == ("counts",)
     np.testing.assert_allclose(counts.occupied[0], 1 - free / CAPACITY)
@@ -270,9 +262,6 @@ def test_usual_days_are_those_of_their_class_and_need_another_day(tmp_path):
         usual_days(y[:1], np.array([0]), "counts")
 
 
-KEYS = ("model", "log_loss", "brier", "crps", "coverage_90", "days", "car_parks")
-
-
 def write(path, days, fault=False):
     def change(park, day, taken):
         return 1.03 if fault and (park, day) == (1, 2) else taken
@@ -287,9 +276,8 @@ def test_an_evaluation_has_a_row_and_a_picture_for_each_model(tmp_path):
     summary = summary_of(tmp_path / "out")
     models = [row["model"] for row in summary["rows"]]
     assert models == ["day-curves", "last-four-weekdays", "last-week", "hour-mean", "gradient-boosting"]
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(
-        [*(f"{m}.png" for m in models), "summary.json"]
-    )
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"summary.json", *(f"{m}.png" for m in models)}
     for row in summary["rows"]:
         assert set(KEYS) <= set(row)
         assert (row["days"], row["car_parks"]) == (20, 2)
@@ -343,15 +331,13 @@ REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupanc
 def test_the_real_logs_slots_are_forecast_better_than_by_simple_models(tmp_path):
     if not REAL_LOG.exists():
         pytest.skip("the CNRPark-EXT log is not in shared/data")
-    done = parkenv("occupancy", "evaluate", REAL_LOG, "--from", "2015-11-25", "--out", tmp_path)
-    assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    ran("occupancy", "evaluate", REAL_LOG, "--from", "2015-11-25", "--out", tmp_path)
+    rows = summary_of(tmp_path)["rows"]
     assert rows[0]["model"] == OURS
     assert rows[0]["days"] == 10
     assert rows[0]["log_loss"] < 0.96 * min(row["log_loss"] for row in rows[1:])
     assert rows[0]["brier"] < min(row["brier"] for row in rows[1:])
     assert min(row["difference_ci95"][0] for row in rows[1:]) > 0
     assert all((tmp_path / f"{row['model']}.png").exists() for row in rows)
-    done = parkenv("occupancy", "evaluate", REAL_LOG, "--from", "2017-01-01", "--out", tmp_path)
-    assert done.returncode == 2
-    assert "has no day from then on with one of its class before it" in done.stderr
+    said = refused("occupancy", "evaluate", REAL_LOG, "--from", "2017-01-01", "--out", tmp_path)
+    assert "has no day from then on with one of its class before it" in said

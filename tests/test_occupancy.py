@@ -17,6 +17,7 @@ from parkenv.world.week import HOUR_S, WEEK_S
 
 NINE = Arrival(9 * HOUR_S)
 KEY = world_key(7, 0)
+QUERY = st.tuples(st.lists(st.integers(0, 19), min_size=1, max_size=6), st.floats(0, 2e5))
 
 
 def constant_process(n, arrival, departure):
@@ -100,14 +101,7 @@ def test_without_rates_a_state_lasts_for_ever():
 
 
 @settings(max_examples=60)
-@given(
-    queries=st.lists(
-        st.tuples(st.lists(st.integers(0, 19), min_size=1, max_size=6), st.floats(0, 2e5)),
-        min_size=1,
-        max_size=12,
-    ),
-    data=st.data(),
-)
+@given(queries=st.lists(QUERY, min_size=1, max_size=12), data=st.data())
 def test_answers_do_not_depend_on_the_order_of_looks(queries, data):
     process = busy_process()
     world = process.world(KEY, NINE)
@@ -152,9 +146,8 @@ def test_at_mean_occupancy_hits_its_target_and_keeps_the_order_of_slots(target):
     process = busy_process()
     shifted = process.at_mean_occupancy(target, NINE.time)
     assert shifted.marginal(NINE.time).mean() == pytest.approx(target, abs=1e-6)
-    assert shifted.arrival_factor / process.arrival_factor == pytest.approx(
-        shifted.arrival_factor[0] / process.arrival_factor[0]
-    )
+    ratio = shifted.arrival_factor / process.arrival_factor
+    assert ratio == pytest.approx(ratio[0])
 
 
 def test_a_file_gives_the_same_process_back(tmp_path):

@@ -178,9 +178,8 @@ def seen_in_worlds(log, process, seed):
 def test_the_day_error_of_many_days_is_recovered(level):
     rng = np.random.default_rng(0)
     n, weeks = 60, 15
-    usual = OccupancyProcess.from_demand(
-        rng.normal(0.5, 1.0, n), np.tile(np.linspace(-1.0, 1.0, 24), 7), 5400.0
-    )
+    demand = np.tile(np.linspace(-1.0, 1.0, 24), 7)
+    usual = OccupancyProcess.from_demand(rng.normal(0.5, 1.0, n), demand, 5400.0)
     looks = simulated_log(usual, weeks, 3600.0)
     log = replace(looks, occupied=seen_in_worlds(looks, usual.with_day_error(DayError(level)), seed=1))
     fitted = fit_day_error(log, usual)

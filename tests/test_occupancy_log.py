@@ -34,9 +34,8 @@ def random_log(n_slots=4, days=(*MONDAYS, *SATURDAYS), seed=0, change_days=()):
     """Observations every half hour from 7 to 19; slot s is taken with the probability (s + 1) / (n + 1)."""
     rng = np.random.default_rng(seed)
     days = tuple(sorted(days))
-    slot, day, step = (
-        a.ravel() for a in np.meshgrid(range(n_slots), range(len(days)), range(24), indexing="ij")
-    )
+    grid = np.meshgrid(range(n_slots), range(len(days)), range(24), indexing="ij")
+    slot, day, step = (a.ravel() for a in grid)
     occupied = rng.random(slot.size) < (slot + 1) / (n_slots + 1)
     changed = np.isin(day, [days.index(d) for d in change_days])
     ids = tuple(f"s{i}" for i in range(n_slots))
@@ -90,15 +89,9 @@ def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tm
         ("", "has the columns '', want bay with arrival and departure, with since and state, or"),
         (HEADER, "has no states of bays, want some"),
         ("datetime,slot,colour\n", "has the columns 'datetime, slot, colour', want bay .*; see --columns"),
-        (
-            HEADER + "2024-01-01 07:00,1,a,sunny,2\n",
-            "1 of 1 rows are unreadable: line 2: the state is '2', want",
-        ),
+        (HEADER + "2024-01-01 07:00,1,a,sunny,2\n", "1 of 1 rows are .*: line 2: the state is '2', want"),
         (HEADER + "yesterday,1,a,sunny,1\n", "1 of 1 rows are unreadable: line 2: a day without a time"),
-        (
-            HEADER + "2024-01-01 07:00+01:00,1,a,sunny,1\n",
-            "has times in UTC or with an offset, want --timezone",
-        ),
+        (HEADER + "2024-01-01 07:00+01:00,1,a,sunny,1\n", "has times .* with an offset, want --timezone"),
         (HEADER + "2024-01-01 07:00,1,,sunny,1\n", "1 of 1 rows are unreadable: line 2: the bay is ''"),
         (HEADER + "2024-01-01 07:00,1,a\n", "line 2: has 3 fields, want 5"),
         (HEADER + "\0\udcff", "not UTF-8 text"),
@@ -123,22 +116,14 @@ def test_a_bad_log_is_refused_by_line(tmp_path, text, message):
     ],
 )
 def test_a_bad_log_object_is_refused(fields, message):
-    good = {
-        "slot_ids": ("a",),
-        "days": MONDAYS[:1],
-        "slot": [0],
-        "day": [0],
-        "second": [1.0],
-        "occupied": [1],
-    }
+    good = {"slot_ids": ["a"], "days": MONDAYS[:1], "slot": [0], "day": [0], "second": [1.0], "occupied": [1]}
     with pytest.raises(InputError, match=message):
         OccupancyLog(**(good | fields))
 
 
 def replay_of(seconds, states):
-    log = OccupancyLog(
-        ("a",), MONDAYS[:1], np.zeros(len(seconds), int), np.zeros(len(seconds), int), seconds, states
-    )
+    zeros = np.zeros(len(seconds), int)
+    log = OccupancyLog(("a",), MONDAYS[:1], zeros, zeros, seconds, states)
     model = RecordedOccupancy(log, np.zeros(1))
     law = StateLaw(np.zeros((1, 48)), np.full(24, 1e-3))
     model._states[0] = day_states(log, np.zeros(1, int), law, np.random.default_rng(0))
@@ -283,22 +268,10 @@ def dated(model, n, day, forecast_from="others"):
         (lambda m: RecordedOccupancy(m.log, [1.0], mapping=[9]), "mapping: want"),
         (lambda m: RecordedOccupancy(m.log, [1.0], forecast_from="past"), "forecast_from is 'past'"),
         (lambda m: dated(m, 1, 1, "rolling").mapped_log(MONDAYS[0]), "want at least one before 2024-01-01"),
-        (
-            lambda m: dated(m, 1, 29).days_in(ArrivalWindow.parse("8:00-9:00", "tue")),
-            "day from 2024-01-29 on is",
-        ),
-        (
-            lambda m: dated(m, 9, 22, "past").mapped_log(MONDAYS[4]),
-            "on 2 days of the class from 2024-01-22 on",
-        ),
-        (
-            lambda m: RecordedOccupancy(m.log, np.zeros(8)).forecast(at(SATURDAYS[0], 9)),
-            "replays 2 of 2 recorded",
-        ),
-        (
-            lambda m: RecordedOccupancy(m.log, np.zeros(80)).forecast(at(MONDAYS[0], 9)),
-            "would serve 20 slots",
-        ),
+        (lambda m: dated(m, 1, 29).days_in(ArrivalWindow.parse("8:00-9:00", "tue")), "day from 2024-01-29"),
+        (lambda m: dated(m, 9, 22, "past").mapped_log(MONDAYS[4]), "2 days of the class from 2024-01-22"),
+        (lambda m: RecordedOccupancy(m.log, np.zeros(8)).forecast(at(SATURDAYS[0], 9)), "replays 2 of 2 "),
+        (lambda m: RecordedOccupancy(m.log, np.zeros(80)).forecast(at(MONDAYS[0], 9)), "serve 20 slots"),
     ],
 )
 def test_what_a_log_cannot_serve_is_refused_in_words(make, message):
@@ -321,10 +294,7 @@ def test_a_mapping_is_read_and_used(tmp_path):
     ("text", "message"),
     [
         ("slot_id,log_slot_id\nZ,s0\n", "line 2: slot_id is 'Z', want a slot of the lot"),
-        (
-            "slot_id,log_slot_id\nA,s9\n",
-            "log_slot_id: none is among the 4 names of the log, whose first is 's0'",
-        ),
+        ("slot_id,log_slot_id\nA,s9\n", "log_slot_id: none is among the 4 names of the log, .* is 's0'"),
         ("slot_id,log_slot_id\nA,s0\nA,s1\n", "line 3: slot_id: 'A' a second time"),
         ("slot_id,log\nA,s0\n", "has the columns 'slot_id, log', want slot_id,log_slot_id"),
     ],

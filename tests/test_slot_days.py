@@ -46,9 +46,8 @@ def test_level_and_habits_are_found(true_sd):
 
 
 def test_few_days_make_a_wide_forecast_and_many_a_narrow_one():
-    widths = [
-        level_sd(fit_slot_days(data), data.days) for n in (3, 10, 60) for data in [simulated(n, 0.3)[0]]
-    ]
+    logs = [simulated(n, 0.3)[0] for n in (3, 10, 60)]
+    widths = [level_sd(fit_slot_days(data), data.days) for data in logs]
     assert widths[0] > 1.3 * widths[1] > 1.3**2 * widths[2]
     assert widths[2] == pytest.approx(0.3, abs=0.1)
 
