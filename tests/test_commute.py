@@ -22,14 +22,8 @@ from parkenv.studies.runner import run
 
 
 def spec(**changes):
-    small = {
-        "scenarios": ["mini"],
-        "agents": ["belief", "first-free"],
-        "maps": ["empty"],
-        "days": 4,
-        "drivers": 1,
-    }
-    return Commute.parse(small | {"jobs": 1} | changes, "test")
+    its = {"scenarios": ["mini"], "agents": ["belief", "first-free"], "maps": ["empty"], "days": 4}
+    return Commute.parse(its | {"drivers": 1, "jobs": 1} | changes, "test")
 
 
 def write_log(path, days):
@@ -114,9 +108,8 @@ def test_drivers_come_on_the_next_weekdays_or_recorded_days(tmp_path):
     log = RecordedOccupancy(log, mini.lot.walk_m(0), np.arange(10))
     recorded = mini.replace(occupancy=log, arrival=ArrivalWindow())
     days = calendar(recorded, 30)
-    assert [(day.count, day.date) for day in days] == [
-        (n, dates[i]) for n, i in ((1, 0), (2, 1), (8, 3), (9, 4))
-    ]
+    wanted = [(n, dates[i]) for n, i in ((1, 0), (2, 1), (8, 3), (9, 4))]
+    assert [(day.count, day.date) for day in days] == wanted
     rows = CommuteRun(recorded, AgentSpec(name="first-free"), "none", 0, 1, 0).run(days)
     assert [row["day"] for row in rows] == [day.date for day in days]
 

@@ -37,9 +37,8 @@ def test_block_faces_differ_and_opposite_ones_are_alike(process):
     within = np.sqrt(((popularity - mean[face]) ** 2).sum() / (len(popularity) - len(faces)))
     assert within == pytest.approx(LAW["between_bays"], rel=0.1)
     assert mean.std() == pytest.approx(LAW["between_faces"], rel=0.2)
-    sides = {
-        tuple(name.rsplit(", ", 1)): value for name, value in zip(faces, mean - mean.mean(), strict=True)
-    }
+    apart = zip(faces, mean - mean.mean(), strict=True)
+    sides = {tuple(name.rsplit(", ", 1)): value for name, value in apart}
     pairs = [(value, sides[block, "right"]) for (block, side), value in sides.items()
              if side == "left" and (block, "right") in sides]  # fmt: skip
     assert np.corrcoef(np.transpose(pairs))[0, 1] == pytest.approx(LAW["opposite_correlation"], abs=0.25)

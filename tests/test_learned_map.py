@@ -19,6 +19,7 @@ from planners import make_agent
 
 MORNING = Arrival(9 * HOUR_S)
 GRID = np.linspace(-15.0, 15.0, 1201)
+NOISY = SensorModel(hit_rate=0.9, false_alarm_rate=0.1)
 
 
 def sigmoid(x):
@@ -59,9 +60,8 @@ def test_the_level_of_the_day_is_integrated_out():
     prior, day, n = 1.0, 1.2, 12
     probability = {}
     for days in (1, n):
-        error = MapError(
-            np.linspace(1.0, -1.0, n), [MapErrorPrior(prior, 0.0, 0.0, 0.0, 0.0, memory_days=1e12)]
-        )
+        of_level = MapErrorPrior(prior, 0.0, 0.0, 0.0, 0.0, memory_days=1e12)
+        error = MapError(np.linspace(1.0, -1.0, n), [of_level])
         for part in np.split(np.arange(n), days):
             error.observe(evidence(part, np.ones(len(part))), np.zeros((1, len(part))), (day, 0.0))
         level, today = GRID[:, None], GRID
@@ -178,11 +178,7 @@ def test_a_car_that_several_drivers_see_counts_once():
         rate = known.decay_rate[0]
         np.testing.assert_allclose(weights[0], 1.0)
         np.testing.assert_allclose(weights[1:], 1.0 - np.exp(-rate * apart_s))
-    for name, hours in (
-        ("once", [9.0]),
-        ("soon", 9.0 + np.arange(4) / 720),
-        ("late", 9.0 + 3 * np.arange(4)),
-    ):
+    for name, hours in (("once", [9]), ("soon", 9 + np.arange(4) / 720), ("late", 9 + 3 * np.arange(4))):
         learned = LearnedMap(EmptyMap(n), np.arange(n), NO_MAP)
         learned.learn([trip(f"{hour}", 0, [3], [True], hour=hour) for hour in hours])
         p[name] = learned.forecast(MORNING).p_occupied[3]
@@ -221,9 +217,7 @@ def test_intervals_of_what_is_learned_hold_the_truth():
     assert np.mean(inside[0.0][10][1]) < 0.75 < np.mean(inside[day_sd][10][1])
 
 
-@pytest.mark.parametrize(
-    "sensor", [SensorModel(), SensorModel(hit_rate=0.9, false_alarm_rate=0.1), SensorModel.blind()]
-)
+@pytest.mark.parametrize("sensor", [SensorModel(), NOISY, SensorModel.blind()])
 def test_a_trip_holds_what_the_agent_observed(sensor):
     """With an exact sensor the observations are the truth; attempts are exact with any sensor."""
     scenario = make_scenario("jam", sensor_model=sensor)

@@ -224,10 +224,8 @@ def test_rows_of_a_stranger_are_checked(mini, tmp_path, change, message):
     with MapStore(tmp_path / "m.sqlite", mini) as store:
         store.add(session(mini, "a"))
     change_rows(tmp_path, lambda row: change(row) and None, "m.sqlite")
-    with (
-        pytest.raises(InputError, match=message),
-        MapStore(tmp_path / "m.sqlite", mini, create=False) as store,
-    ):
+    file = tmp_path / "m.sqlite"
+    with pytest.raises(InputError, match=message), MapStore(file, mini, create=False) as store:
         store.log()
 
 
