@@ -46,10 +46,8 @@ def test_a_help_page_says_what_a_newcomer_needs(path, command, monkeypatch):
     for option in command.params:
         if option.param_type_name == "option":
             assert option.help, option.name
-            flag = option.is_flag or option.required
-            assert (
-                flag or option.default is not None or "[default: " in option.help or option.name in OPTIONAL
-            ), option.name
+            told = option.is_flag or option.required or option.default is not None
+            assert told or "[default: " in option.help or option.name in OPTIONAL, option.name
     examples = page.partition("Examples:\n")[2].partition("\n\n")[0]
     assert examples
     for line in examples.replace("\\\n      ", " ").splitlines():
@@ -98,9 +96,8 @@ def test_names_are_those_of_the_modules_behind_them_and_listed_in_help():
         assert name in re.sub(r"- +", "-", page)
 
 
-REFUSALS = [
-    line.split(" => ") for line in Path(__file__).with_name("refusals.txt").read_text().splitlines()[1:]
-]
+TABLE = Path(__file__).with_name("refusals.txt").read_text().splitlines()
+REFUSALS = [line.split(" => ") for line in TABLE[1:]]
 
 
 @pytest.mark.parametrize(("words", "said"), REFUSALS, ids=[words for words, _ in REFUSALS])
@@ -148,10 +145,8 @@ def answers():
     """Lines that calls print, and the large modules that are loaded after each, in one process of their own."""
     calls = [((option,), {}) for option in ("--version", "--help")]
     calls += [((*name.split(), "--help"), {}) for name in HELPED]
-    of_shell = {"_PARKENV_COMPLETE": "complete_bash"}
-    calls += [
-        ((), of_shell | {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}) for line in COMPLETIONS
-    ]
+    shell = {"_PARKENV_COMPLETE": "complete_bash"}
+    calls += [((), shell | {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}) for line in COMPLETIONS]
     program = [sys.executable, "-c", FRESH, json.dumps(calls)]
     done = subprocess.run(program, capture_output=True, text=True, timeout=120, check=True)
     return dict(zip(("--version", "--help", *HELPED, *COMPLETIONS), json.loads(done.stdout), strict=True))
@@ -217,9 +212,8 @@ def test_an_unforeseen_error_is_one_line_and_a_file(monkeypatch, error):
     ended = parkenv("lot", "show", "mini")
     assert ended.returncode == 70
     assert ended.stderr.count("\n") == 1
-    found = re.search(
-        rf"parkenv: error: unforeseen {type(error).__name__}: .*report it with (\S+\.txt)\n", ended.stderr
-    )
+    told = rf"parkenv: error: unforeseen {type(error).__name__}: .*report it with (\S+\.txt)\n"
+    found = re.search(told, ended.stderr)
     assert "in fail" in Path(found[1]).read_text()
     Path(found[1]).unlink()
 
@@ -248,9 +242,8 @@ def test_closed_streams_and_readers_that_end_do_not_stop_a_command(tmp_path):
     command = shlex.join([*PARKENV, "lot", "show", "mini", "--out", str(shown)])
     assert subprocess.run(f"{command} >&- 2>&-", shell=True).returncode == 0
     assert shown.exists()
-    with subprocess.Popen(
-        [*PARKENV, "schema", "compare"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as command:
-        command.stdout.close()
-        complaints = command.stderr.read()
-    assert (command.returncode, complaints) == (1, b"")
+    words = [*PARKENV, "schema", "compare"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        complaints = process.stderr.read()
+    assert (process.returncode, complaints) == (1, b"")

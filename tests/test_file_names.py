@@ -24,6 +24,8 @@ from parkenv.show.figures.lot import save_lot_picture
 
 HOSTILE = "..[bold]$a_{$:b*?<|> CON.txt " + "ℵ" * 50
 """A name that scenario files may have."""
+NAMES = st.sampled_from(["a", "A", "a.png", "b"])
+FILES = st.builds("{}/{}.{}".format, st.sampled_from(["x", "y"]), NAMES, st.sampled_from(["png", "jpg"]))
 
 
 @given(st.text(st.characters(exclude_categories=()), max_size=400))
@@ -45,10 +47,6 @@ def test_different_names_have_different_files():
         "a/b", "a:b", "a_b", "..", ".", "", "con", "CON", "con.txt", "x" * 300, "x" * 301, "a\0b", "\ud800",
     ]  # fmt: skip
     assert len({file_name(name) for name in names}) == len(names)
-
-
-NAMES = st.sampled_from(["a", "A", "a.png", "b"])
-FILES = st.builds("{}/{}.{}".format, st.sampled_from(["x", "y"]), NAMES, st.sampled_from(["png", "jpg"]))
 
 
 @given(st.lists(FILES.map(Path), max_size=12))
@@ -155,12 +153,9 @@ class Patient(SearchAgent):
 @pytest.mark.slow
 def test_a_comparison_with_workers_and_figures_takes_a_users_class_and_nothing_else_from_the_folder(folder):
     (folder / "my_agents.py").write_text(PATIENT)
-    words = (
-        "compare --scenario mini --agents my_agents:Patient,first-free -n 2 --jobs 2 --occupancy-levels none"
-    )
-    done = subprocess.run(
-        [*COMMAND, *words.split(), "--out", "out", "--report"], cwd=folder, capture_output=True, text=True
-    )
+    words = "compare --scenario mini --agents my_agents:Patient,first-free -n 2 --jobs 2 --out out --report"
+    command = [*COMMAND, *words.split(), "--occupancy-levels", "none"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert ",patient," in (folder / "out" / "episodes.csv").read_text()
     assert (folder / "out" / "report.html").is_file()
@@ -171,9 +166,7 @@ def test_a_comparison_with_workers_and_figures_takes_a_users_class_and_nothing_e
 def test_a_users_class_is_found_after_everything_else(folder):
     (folder / "mine.py").write_text("import colorsys\nclass A:\n    def predict(self): ...\n")
     (folder / "colorsys.py").write_text(f"open({str(folder / 'ran')!r}, 'a').write('colorsys')")
-    code = (
-        "from parkenv.files.user_class import load_class as load; print(load('mine:A', 'agent', 'predict'))"
-    )
+    code = "from parkenv.files.user_class import load_class; print(load_class('mine:A', 'agent', 'predict'))"
     done = subprocess.run([sys.executable, "-P", "-c", code], cwd=folder, capture_output=True, text=True)
     assert done.stdout == "<class 'mine.A'>\n", done.stderr
     assert not (folder / "ran").exists()
@@ -184,9 +177,8 @@ def test_a_users_class_is_found_after_everything_else(folder):
     [(["-m", "parkenv"], signal.SIGINT, 130), (["parkenv"], signal.SIGTERM, 143)],
 )
 def test_a_signal_before_anything_is_imported_ends_the_command(tmp_path, command, number, code):
-    (tmp_path / "gymnasium.py").write_text(
-        f"import os, time\nos.kill(os.getpid(), {number:d})\ntime.sleep(9)\n"
-    )
+    dies = f"import os, time\nos.kill(os.getpid(), {number:d})\ntime.sleep(9)\n"
+    (tmp_path / "gymnasium.py").write_text(dies)
     (tmp_path / "parkenv").write_text("from parkenv.__main__ import main\nmain()\n")
     path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[1])])
     done = subprocess.run(
@@ -203,8 +195,11 @@ def test_an_import_changes_no_settings_of_a_users_own_process(folder):
     for module in folder.glob("*.py"):
         module.unlink()
     code = (
-        "import sys, os, parkenv\n"
+        "import os, signal, sys\n"
+        "before = [signal.getsignal(number) for number in signal.valid_signals()]\n"
+        "import parkenv\n"
         "loaded = {'numba', 'matplotlib'} & set(sys.modules)\n"
+        "assert before == [signal.getsignal(number) for number in signal.valid_signals()]\n"
         "import matplotlib\n"
         "print(loaded, matplotlib.rcParams['text.usetex'], os.environ.get('PYTHONSAFEPATH'))"
     )

@@ -16,25 +16,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from parkenv import InputError
-from parkenv.files import csv_tables
+from parkenv.files import csv_tables, limited_reading
 from parkenv.files.csv_tables import TEXT, csv_text, typed_records
 from parkenv.files.images import decode_image
-from parkenv.files.limited_reading import (
-    MAX_MEMBERS,
-    csv_records,
-    csv_rows,
-    open_limited,
-    parse_arrays,
-    parse_zip,
-    read_arrays,
-    read_bytes,
-    read_json,
-    read_toml,
-    read_yaml,
-)
 from parkenv.lots import packaged_lot
 from parkenv.mapping.store import MapStore
 from parkenv.studies.training.curve_file import read_curve
+
+DEEP = 100_000
+EVALUATION = {"steps": "0", "total_s": "80.0", "low_s": "nan", "wall_s": "4.5"}
 
 
 def npy(descr="'<f8'", shape="(2,)", content=bytes(16), version=b"\x01\x00"):
@@ -59,18 +49,15 @@ def png(width, height, rows=b""):
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*its) for its in chunks.items())
 
 
-DEEP = 100_000
-
-
 @pytest.mark.parametrize(
     ("read", "content", "message"),
     [
-        (read_json, "[" * DEEP, "not JSON: nested deeper than 200 levels"),
-        (read_json, '{"a":' * DEEP, "not JSON: nested deeper than 200 levels"),
-        (read_json, b"\xff\xfe", "not UTF-8 text"),
-        (read_toml, "a = " + "[" * DEEP, "not TOML: nested deeper"),
-        (read_toml, ".".join("a" * DEEP) + " = 1", "not TOML: nested deeper"),
-        (read_yaml, "[" * DEEP, "not YAML: nested deeper than 100 levels"),
+        (limited_reading.read_json, "[" * DEEP, "not JSON: nested deeper than 200 levels"),
+        (limited_reading.read_json, '{"a":' * DEEP, "not JSON: nested deeper than 200 levels"),
+        (limited_reading.read_json, b"\xff\xfe", "not UTF-8 text"),
+        (limited_reading.read_toml, "a = " + "[" * DEEP, "not TOML: nested deeper"),
+        (limited_reading.read_toml, ".".join("a" * DEEP) + " = 1", "not TOML: nested deeper"),
+        (limited_reading.read_yaml, "[" * DEEP, "not YAML: nested deeper than 100 levels"),
     ],
 )
 def test_a_text_that_is_too_deep_or_damaged_is_refused(tmp_path, read, content, message):
@@ -84,25 +71,25 @@ def test_a_text_that_is_too_deep_or_damaged_is_refused(tmp_path, read, content, 
 
 
 def test_json_is_read_exactly(tmp_path):
-    (tmp_path / "a").write_text(
-        '\ufeff{"a": [1, -0.1, 1e-300, true, null, "é\\u0000"], "b": 9007199254740993}'
-    )
-    assert read_json(tmp_path / "a") == {"a": [1, -0.1, 1e-300, True, None, "é\0"], "b": 9007199254740993}
+    text = '\ufeff{"a": [1, -0.1, 1e-300, true, null, "é\\u0000"], "b": 9007199254740993}'
+    (tmp_path / "a").write_text(text)
+    wanted = {"a": [1, -0.1, 1e-300, True, None, "é\0"], "b": 9007199254740993}
+    assert limited_reading.read_json(tmp_path / "a") == wanted
 
 
 def test_bytes_are_counted_unpacked(tmp_path):
     (tmp_path / "a.gz").write_bytes(gzip.compress(bytes(10_000_000)))
-    assert len(read_bytes(tmp_path / "a.gz", 10_000_000)) == 10_000_000
+    assert len(limited_reading.read_bytes(tmp_path / "a.gz", 10_000_000)) == 10_000_000
     with pytest.raises(InputError, match="has more than 9,999,999 bytes"):
-        read_bytes(tmp_path / "a.gz", 9_999_999)
+        limited_reading.read_bytes(tmp_path / "a.gz", 9_999_999)
     (tmp_path / "a.gz").write_bytes(gzip.compress(b"abc" * 1000)[:-9])
     with pytest.raises(InputError, match="not a whole gzip file"):
-        read_bytes(tmp_path / "a.gz")
+        limited_reading.read_bytes(tmp_path / "a.gz")
 
 
 @pytest.mark.parametrize("name", ["absent", ".", "a\0b", "\ud800", "x" * 300])
 def test_what_cannot_be_opened_is_named(tmp_path, name):
-    with pytest.raises(InputError) as caught, open_limited(tmp_path / name):
+    with pytest.raises(InputError) as caught, limited_reading.open_limited(tmp_path / name):
         pass
     str(caught.value).encode()
 
@@ -114,39 +101,39 @@ def test_pipes_devices_and_files_that_state_no_size_are_not_waited_for(tmp_path)
     devices = [name for name in ("/dev/zero", "/dev/tty") if Path(name).is_char_device()]
     for name in ("pipe", "link", *devices):
         with pytest.raises(InputError, match=r"is a pipe or a device, want a file|No such"):
-            read_bytes(tmp_path / name)
+            limited_reading.read_bytes(tmp_path / name)
     with pytest.raises(InputError, match="is not a file"):
         MapStore(tmp_path / "pipe", packaged_lot("mini"), create=False)
     for name in ("proc", "proc.gz"):
         (tmp_path / name).symlink_to("/proc/version")  # /proc/kmsg, which waits, needs rights
-        assert read_bytes(tmp_path / name) == b""
+        assert limited_reading.read_bytes(tmp_path / name) == b""
 
 
 def test_csv_rows_have_one_width(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text('a,b\n1,"2\n3"\n\n4')
-    assert next(csv_records(path)) == (3, {"a": "1", "b": "2\n3"})
+    assert next(limited_reading.csv_records(path)) == (3, {"a": "1", "b": "2\n3"})
     with pytest.raises(InputError, match="line 5: has 1 fields, want 2"):
-        list(csv_rows(path))
+        list(limited_reading.csv_rows(path))
     path.write_text("a\n" + "x" * 200_000)
     with pytest.raises(InputError, match="line 2: not CSV: field larger"):
-        list(csv_rows(path))
+        list(limited_reading.csv_rows(path))
 
 
 def test_a_zip_is_measured_before_it_is_unpacked():
     data = zipped(card="{}", data=b"x" * 1000)
-    assert parse_zip(data, "a") == {"card": b"{}", "data": b"x" * 1000}
+    assert limited_reading.parse_zip(data, "a") == {"card": b"{}", "data": b"x" * 1000}
     with pytest.raises(InputError, match="unpacks to 1,002 bytes, want at most 500"):
-        parse_zip(data, "a", 500)
+        limited_reading.parse_zip(data, "a", 500)
     with pytest.raises(InputError, match="holds 10,001 files"):
-        parse_zip(zipped(**{str(i): "" for i in range(MAX_MEMBERS + 1)}), "a")
+        limited_reading.parse_zip(zipped(**{str(i): "" for i in range(limited_reading.MAX_MEMBERS + 1)}), "a")
     with pytest.raises(InputError, match="not a zip archive"):
-        parse_zip(b"PK\x03\x04 no zip", "a")
+        limited_reading.parse_zip(b"PK\x03\x04 no zip", "a")
     otherwise = io.BytesIO()
     with zipfile.ZipFile(otherwise, "w", zipfile.ZIP_LZMA) as archive:
         archive.writestr("a", b"x" * 1000)
     with pytest.raises(InputError, match="deflate"):
-        parse_zip(otherwise.getvalue(), "a")
+        limited_reading.parse_zip(otherwise.getvalue(), "a")
 
 
 def test_arrays_are_read_as_numpy_wrote_them(tmp_path):
@@ -157,7 +144,7 @@ def test_arrays_are_read_as_numpy_wrote_them(tmp_path):
         "d": np.zeros((0, 3), np.float32),
     }
     np.savez_compressed(tmp_path / "a.npz", **arrays)
-    read = read_arrays(tmp_path / "a.npz")
+    read = limited_reading.read_arrays(tmp_path / "a.npz")
     assert read.keys() == arrays.keys()
     for name, array in arrays.items():
         np.testing.assert_array_equal(read[name], array)
@@ -175,7 +162,7 @@ def test_arrays_are_read_as_numpy_wrote_them(tmp_path):
 )  # fmt: skip
 def test_an_array_is_as_large_as_its_header_says(member):
     with pytest.raises(InputError, match=r"a\.npz: a\.npy: not an array of numbers"):
-        parse_arrays(zipped(**{"a.npy": member}), "a.npz")
+        limited_reading.parse_arrays(zipped(**{"a.npy": member}), "a.npz")
 
 
 @pytest.mark.parametrize(
@@ -196,9 +183,6 @@ def test_an_image_is_measured_before_it_is_decoded(data, message):
         decode_image(data, "a.png")
 
 
-EVALUATION = {"steps": "0", "total_s": "80.0", "low_s": "nan", "wall_s": "4.5"}
-
-
 def write(path, row):
     path.write_text(f"{','.join(row)}\n{','.join(row.values())}\n")
     return path
@@ -210,14 +194,11 @@ def test_good_tables_are_read(tmp_path):
     assert read_curve(tmp_path / "none.csv") == []
 
 
-NUMBER = "a number, at most 1e+12"
-
-
 @pytest.mark.parametrize(
     ("column", "value", "wanted"),
     [
         ("steps", "1e5", "a whole number of at most 15 digits"),
-        ("total_s", "fast", f"{NUMBER}, or nan"),
+        ("total_s", "fast", "a number, at most 1e+12, or nan"),
     ],
 )
 def test_a_wrong_value_is_named(tmp_path, column, value, wanted):

@@ -45,18 +45,12 @@ def processes_with(mark):
 
 def test_a_stopped_command_leaves_no_process_and_says_how_to_go_on(tmp_path):
     out, mark = tmp_path / "out", f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
-    words = (
-        "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures"
-    )
+    words = "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --no-figures --jobs 2 --out"
     command = subprocess.Popen(
-        [sys.executable, "-m", "parkenv", *words.split(), "--jobs", "2", "--out", out],
-        env=os.environ | dict([mark.split("=")]),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+        [sys.executable, "-m", "parkenv", *words.split(), out, "--occupancy-levels", "none"], text=True,
+        env=os.environ | dict([mark.split("=")]), start_new_session=True,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
     stored, deadline = out / "results.sqlite-wal", time.monotonic() + 60.0
     while not (stored.exists() and stored.stat().st_size > 10_000):
         assert time.monotonic() < deadline
@@ -234,9 +228,8 @@ def test_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
 )
 def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, command):
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "summary.json").write_text(
-        json.dumps({"command": ["parkenv", "park"], "version": "0.1.0", "rows": [{"lot": "mini"}]})
-    )
+    summary = {"command": ["parkenv", "park"], "version": "0.1.0", "rows": [{"lot": "mini"}]}
+    (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
     (tmp_path / "file").touch()
     done = parkenv(*command, "--out", "file/made", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
