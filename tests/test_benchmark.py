@@ -1,6 +1,5 @@
 """The benchmark suite: results can be checked, and altered ones are rejected."""
 
-import csv
 import itertools
 import json
 from collections import Counter
@@ -8,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import ran, refused
+from command_line import ran, refused, rows_in, summary_of
 from test_report import data_of
 
 from parkenv import InputError
@@ -34,6 +33,7 @@ from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival
 
 AGENTS = ("first-free", "greedy-goal")
+TIMES = "episodes.first-free.mini.total_s"
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +71,6 @@ def test_a_result_passes_its_own_check_and_scores_are_shares(result, small, tmp_
         assert row["score"] == pytest.approx(bound / row["total_s"], abs=1e-4)
         # The bound is a control variate: its estimate is its mean over the population.
         assert row["total_s"] - row["regret_s"] == pytest.approx(bound, abs=1e-5)
-
-
-TIMES = "episodes.first-free.mini.total_s"
 
 
 def times_of(content):
@@ -228,16 +225,13 @@ def test_the_protocol_runs_on_recorded_days_and_says_what_it_leaves_out(tmp_path
     (tmp_path / "real.toml").write_text('lot = "mini"\noccupancy = { log = "log.csv", mapping = "same" }')
     (tmp_path / "beginner.py").write_text(BEGINNER)
     monkeypatch.setattr("parkenv.studies.benchmark.suite.SEARCHES_ON", 6)
-    command = (
-        "benchmark run streets-v1 --on real.toml --agents first-free,beginner:Beginner --jobs 1 --out out"
-    )
-    said = ran(command, cwd=tmp_path)
+    agents = "first-free,beginner:Beginner"
+    said = ran(f"benchmark run streets-v1 --on real.toml --agents {agents} --jobs 1 --out out", cwd=tmp_path)
     assert "task saturday is left out" in said.stderr + said.stdout
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "out")
     assert [row["scenario"] for row in summary["tasks"][::2]] == ["morning", "noon", "evening"]
     assert [(row["scenario"], row["episodes"]) for row in summary["rows"]] == [("real", 18)] * 2
-    with (tmp_path / "out" / "episodes.csv").open() as file:
-        own = [row for row in csv.DictReader(file) if row["agent"] == "first-free"]
+    own = [row for row in rows_in(tmp_path / "out" / "episodes.csv") if row["agent"] == "first-free"]
     wanted = mean_over_days([float(row["total_s"]) for row in own], [row["day"] for row in own])
     assert len({row["day"] for row in own}) > 2
     assert all(8 * 3600 <= float(row["arrival_s"]) % 86_400 <= 19 * 3600 for row in own)

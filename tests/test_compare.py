@@ -1,6 +1,5 @@
 """`parkenv compare` and related commands: results, resuming, errors."""
 
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,10 @@ from parkenv.studies.results import DECISIONS
 from parkenv.studies.statistics import MEANS, mean_interval, summarize
 from parkenv.studies.study import Cell
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
+LOG = "datetime,camera,slot_id,weather,occupied\n"
+ONE_DAY = LOG + "".join(
+    f"2015-11-12 {hour:02d}:09,1,s{slot},sunny,{slot % 2}\n" for hour in range(7, 14) for slot in range(10)
+)
 
 
 def small(out, *more, agents="mdp,greedy-goal,oracle", episodes=12):
@@ -126,9 +128,6 @@ def test_plan_writes_a_path_and_a_picture_to_a_goal_anywhere(tmp_path, lot_file)
     ran("plan", "--lot", lot_file, "--goal", "5,5", "--out", tmp_path / "plan")
 
 
-# --- statistics ------------------------------------------------------------------------------------
-
-
 def episode(seed, total, parked=True):
     return {**dict.fromkeys(MEANS, 0.0), "seed": seed, "total_s": total, "parked": parked, DECISIONS: ""}
 
@@ -152,11 +151,7 @@ def test_an_agent_is_called_the_fastest_only_where_no_interval_includes_0(n, slo
     scenario, noise = make_scenario("mini"), rng.normal(0.0, 5.0, n)
     cases = [Case(scenario, name) for name in ("mdp", "belief", "oracle")]
     later = {"mdp": np.zeros(n), "belief": slower_s + noise - noise.mean(), "oracle": np.full(n, -20.0)}
-    finished = {
-        case.key(seed): episode(seed, 100.0 + seed + later[case.agent][seed])
-        for case in cases
-        for seed in range(n)
-    }
+    finished = {case.key(s): episode(s, 100.0 + s + later[case.agent][s]) for case in cases for s in range(n)}
     rows = table([Cell(case, range(n)) for case in cases], finished)
     assert [row["agent"] for row in rows if row["leads"]] == leaders
     (finding,) = Comparison.findings({"rows": rows})
@@ -175,14 +170,6 @@ def test_where_a_search_gave_up_the_median_and_their_share_stand_beside_the_mean
     assert "median_s" not in [column["key"] for column in table_of("rows", "Results", rows[1:])["columns"]]
 
 
-# --- faults ----------------------------------------------------------------------------------------
-
-LOG = "datetime,camera,slot_id,weather,occupied\n"
-ONE_DAY = LOG + "".join(
-    f"2015-11-12 {hour:02d}:09,1,s{slot},sunny,{slot % 2}\n" for hour in range(7, 14) for slot in range(10)
-)
-
-
 @pytest.fixture
 def lot_file(tmp_path):
     path = tmp_path / "lot.geojson"
@@ -192,11 +179,7 @@ def lot_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "wanted"),
-    [
-        (LOG + "2015-11-12 09:09,1,a,sunny,2\n", "line 2"),
-        (LOG, "log.csv"),
-        (ONE_DAY, "at least one more to forecast from"),
-    ],
+    [(LOG + "2015-11-12 09:09,1,a,,2\n", "line 2"), (LOG, "log.csv"), (ONE_DAY, "one more to forecast from")],
 )
 def test_bad_logs_are_one_clear_line(tmp_path, lot_file, text, wanted):
     (tmp_path / "log.csv").write_text(text)

@@ -19,9 +19,7 @@ def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     through_sensors, without_images = summary["rows"][: len(AGENTS)], summary["rows"][len(AGENTS) :]
     assert {row["episodes"] for row in through_sensors} == {QUICK["episodes"]}
     assert {row["episodes"] for row in without_images} == {10}
-    assert all(row["leads"] for row in through_sensors if row["agent"] != "oracle"), (
-        "two searches show nothing"
-    )
+    assert all(row["leads"] for row in through_sensors if row["agent"] != "oracle"), "two show nothing"
     assert done.stdout.index(str(out / "lot.png")) < done.stdout.index("Compiling")
     assert all(row["regret_s"] >= -1e-6 for row in summary["rows"])
     for name in ("lot.png", "report.html", "search.gif"):

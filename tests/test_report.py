@@ -24,9 +24,9 @@ from parkenv.studies.study import ExecutionSpec, ReportOptions
 from parkenv.world.lot import PARK
 
 
-def data_of(page):
+def data_of(page, name="report-data"):
     text = page.read_text(encoding="utf-8")
-    return json.loads(re.search(r'id="report-data">(.*?)</script>', text, flags=re.DOTALL)[1])
+    return json.loads(re.search(rf'id="{name}">(.*?)</script>', text, flags=re.DOTALL)[1])
 
 
 @pytest.fixture(scope="module")
@@ -145,12 +145,8 @@ def test_a_total_that_differs_is_told(run, tmp_path, capsys):
 def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
     lot, out = tmp_path / "lot.geojson", tmp_path / "compare"
     write_lot(packaged_lot("mini"), lot)
-    ran(
-        "compare --agents mdp,oracle -n 2 --occupancy-levels none --no-figures --jobs 1 --out",
-        out,
-        "--lot",
-        lot,
-    )
+    words = "compare --agents mdp,oracle -n 2 --occupancy-levels none --no-figures --jobs 1 --out"
+    ran(words, out, "--lot", lot)
     make_report(out, ExecutionSpec(jobs=1))
     assert len(data_of(out / "report.html")["worlds"]) == 2
     lot.write_text(lot.read_text() + "\n")
@@ -199,11 +195,8 @@ def test_text_in_the_data_ends_no_element_and_episodes_of_other_commands_are_no_
 
 def test_searches_are_chosen_in_turns_over_settings():
     mini = make_scenario("mini")
-    cases = [
-        (Case(mini.replace(failure_s=cost), agent), range(5, 9))
-        for cost in (1.0, 2.0)
-        for agent in ("mdp", "oracle")
-    ]
+    settings = itertools.product((1.0, 2.0), ("mdp", "oracle"))
+    cases = [(Case(mini.replace(failure_s=cost), agent), range(5, 9)) for cost, agent in settings]
     chosen = choose(cases, 7)
     assert [(e.cases[0].scenario.failure_s, e.seed) for e in chosen] == [(1.0, 5), (2.0, 5), (1.0, 6)]
     assert len(choose(cases, 1)) == 1

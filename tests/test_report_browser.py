@@ -67,10 +67,8 @@ def test_a_comparison_has_the_numbers_of_its_summary_sorts_and_replays(browser, 
     browser.execute_script("document.activeElement.blur()")
     world, slider = data["worlds"][0], one(browser, "#replay input[type=range]")
     panels = every(browser, "#replay .panel")
-    searches = [
-        next(s for s in world["searches"] if s["agent"] == panel.get_attribute("data-agent"))
-        for panel in panels
-    ]
+    of_agent = {search["agent"]: search for search in world["searches"]}
+    searches = [of_agent[panel.get_attribute("data-agent")] for panel in panels]
     moments = sorted({t / 100 for s in searches for t in s["t"]} | {s["total_s"] for s in searches})
     keys = ActionChains(browser)
     for key, expected in ((Keys.ARROW_RIGHT, moments[1]), (Keys.ARROW_RIGHT, moments[2]), (Keys.HOME, 0.0)):

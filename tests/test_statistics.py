@@ -55,9 +55,8 @@ def test_intervals_cover_the_mean_of_the_population_and_the_error_is_the_designs
         covered += low <= values.mean() <= high
         errors.append(estimate.error)
         found.append(estimate.mean)
-    wanted = np.sqrt(
-        sum(w**2 * (spread * noise)[p].var() / n for w, p, n in zip(shares, parts, counts, strict=True))
-    )
+    sizes = zip(shares, parts, counts, strict=True)
+    wanted = np.sqrt(sum(w**2 * (spread * noise)[part].var() / n for w, part, n in sizes))
     assert np.std(found) == pytest.approx(wanted, rel=0.1)
     assert np.mean(np.square(errors)) == pytest.approx(wanted**2, rel=0.1)
     assert (0.9 if heavy else 0.935) <= covered / 1000 <= 0.965
