@@ -95,10 +95,8 @@ def kept(folder):
 def test_code_that_two_processes_have_compiled_works_together(own, tmp_path):
     """Numba's `sort` and `argsort` have functions of the same name, and each is the same one of its process."""
     for name, body in (("lowest", "x.sort(); return x[0]"), ("first", "return x.argsort()[0]")):
-        write(
-            own / f"{name}.py",
-            f"from parkenv.compiled.jit import compiled\n@compiled\ndef {name}(x):\n    {body}\n",
-        )
+        text = f"from parkenv.compiled.jit import compiled\n@compiled\ndef {name}(x):\n    {body}\n"
+        write(own / f"{name}.py", text)
         prints = f"import numpy as np\nfrom {name} import {name}\nprint({name}(np.array([3.0, 1.0, 2.0])))\n"
         assert result(start(own, tmp_path / "cache", prints))[0] == 1.0
     both = "import numpy as np\nfrom lowest import lowest\nfrom first import first\nx = np.array([3.0, 4.0, 2.0])\n"

@@ -215,37 +215,25 @@ def test_an_example_says_how_long_it_takes(path):
         assert re.search(r"\b(seconds|minutes?)\b", said), f"{path}: says not how long it takes"
 
 
-NOTEBOOK = Path(__file__).parents[1] / "examples" / "main_story.ipynb"
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_the_notebook_runs_and_shows_its_pictures(tmp_path):
     nbformat = pytest.importorskip("nbformat")
     client = pytest.importorskip("nbclient").NotebookClient
-    notebook = nbformat.read(NOTEBOOK, 4)
+    notebook = nbformat.read(ROOT / "examples" / "main_story.ipynb", 4)
     client(notebook, timeout=1800).execute(cwd=str(tmp_path))
-    shown = [
-        output
-        for cell in notebook.cells
-        for output in cell.get("outputs", [])
-        if "image/png" in output.get("data", {})
-    ]
-    assert len(shown) == 4
-
-
-DOCS = Path(__file__).parents[1] / "docs"
+    shown = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("image/png" in output.get("data", {}) for output in shown) == 4
 
 
 @pytest.mark.slow  # recomputes the bounds of all searches of the suites
 def test_the_pages_of_the_leaderboard_are_those_of_its_result_files():
-    spec = importlib.util.spec_from_file_location("leaderboard", DOCS / "leaderboard.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    for name, folder in script.PAGES.items():
-        there = (script.FOLDER / name).read_text(encoding="utf-8")
-        assert script.page(there, folder) == there, "run: python docs/leaderboard.py"
-        assert all(file.stat().st_size < 250_000 for file in script.result_files(script.FOLDER / folder))
+    leaderboard = script("leaderboard")
+    for name, folder in leaderboard.PAGES.items():
+        there = (leaderboard.FOLDER / name).read_text(encoding="utf-8")
+        assert leaderboard.page(there, folder) == there, "run: python docs/leaderboard.py"
+        files = leaderboard.result_files(leaderboard.FOLDER / folder)
+        assert all(file.stat().st_size < 250_000 for file in files)
 
 
 PAPER = (ROOT / "paper.md").read_text(encoding="utf-8")
@@ -260,9 +248,8 @@ def test_the_paper_has_the_journals_form_and_cites_what_it_lists():
     _, head, body = PAPER.split("---\n", 2)
     about = yaml.safe_load(head)
     assert {"title", "tags", "authors", "affiliations", "date", "bibliography"} <= about.keys()
-    assert {author["affiliation"] for author in about["authors"]} == {
-        its["index"] for its in about["affiliations"]
-    }
+    places = {author["affiliation"] for author in about["authors"]}
+    assert places == {its["index"] for its in about["affiliations"]}
     assert re.findall(r"^# (.*)$", body, re.M) == list(SECTIONS)
     assert 750 <= len(body.split()) <= 1750
     listed = re.findall(r"^@\w+\{(\w+),", (ROOT / about["bibliography"]).read_text(encoding="utf-8"), re.M)

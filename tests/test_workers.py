@@ -24,6 +24,7 @@ from parkenv.studies.workers import SERIAL, Workers, kill_workers
 each_backend = pytest.mark.parametrize(
     "backend", ["loky", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ray", "dask"))]
 )
+TOY, LONG = Toy(jobs=1), Toy(jobs=1, numbers=40)
 
 
 @pytest.fixture(autouse=True)
@@ -146,9 +147,6 @@ def test_what_does_not_go_together_or_answer_is_refused_at_once(arguments, wante
     assert time.monotonic() - start < 15.0
 
 
-TOY, LONG = Toy(jobs=1), Toy(jobs=1, numbers=40)
-
-
 def files_of(folder):
     return {path.name: path.read_text() for path in folder.iterdir() if path.name != "results.sqlite"}
 
@@ -159,9 +157,8 @@ def test_a_study_runs_without_a_folder_and_its_result_holds_the_files():
     assert result.complete
     assert result.summary["command"] == ["parkenv", "run", "experiment.json"]
     folder = result.folder
-    assert {"powers.csv", "summary.json", "settings.json", "experiment.json", "done.txt"} <= {
-        *files_of(folder)
-    }
+    files = {"powers.csv", "summary.json", "settings.json", "experiment.json", "done.txt"}
+    assert files <= files_of(folder).keys()
     del result
     assert not folder.exists()
 
@@ -259,13 +256,9 @@ def test_a_killed_run_keeps_what_is_finished_and_is_resumed_to_the_same_files(tm
         "with stop_signals(): run(toy, Path(sys.argv[1]), progress=tell)\n"
     )
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, tmp_path, str(jobs)],
-        env={**os.environ, "PYTHONPATH": path},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
+    command = [sys.executable, "-c", script, tmp_path, str(jobs)]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, text=True, **streams)
     told = next(done for line in process.stdout if (done := int(line)) >= 8)
     process.send_signal(number)
     process.communicate()
