@@ -22,9 +22,8 @@ ROUNDING = 1e-9
 class Statement(NamedTuple):
     case: str  # what is compared, with its parameters
     expected: float  # what theory says
-    found: Callable[
-        [], object
-    ]  # runs planners or worlds: a number, or independent samples with the expected mean
+    # Runs planners or worlds: a number, or independent samples with the expected mean.
+    found: Callable[[], object]
     tolerance: float = 0.0  # difference that is allowed besides
     slow: bool = False  # takes more than a few seconds
 

@@ -63,9 +63,7 @@ class ChangingSolution:
 
 
 @compiled
-def _iterate(
-    values, choices, free, moves, seconds, steps, view_starts, view_slots, cost_s, give_up_s, memory_steps
-):
+def _iterate(values, choices, free, moves, seconds, steps, starts, viewed, cost_s, give_up_s, memory_steps):
     n_vertices, n_states = values.shape
     n = len(free)
     n_codes = 2 * memory_steps + 1
@@ -83,8 +81,8 @@ def _iterate(
                     codes[s] = rest % n_codes
                     rest //= n_codes
                     all_taken = all_taken and codes[s] > memory_steps
-                for i in range(view_starts[v], view_starts[v + 1]):
-                    c = codes[view_slots[i]]
+                for i in range(starts[v], starts[v + 1]):
+                    c = codes[viewed[i]]
                     # Slots in view were observed just now, except at the start of the search.
                     possible = possible and (state == 0 or c == 1 or c == 1 + memory_steps)
                 if not possible:
@@ -111,12 +109,12 @@ def _iterate(
                             c = min(c + steps[v, m], 2 * memory_steps)
                         aged[s] = c
                         base += c * powers[s]
-                    first, k = view_starts[u], view_starts[u + 1] - view_starts[u]
+                    first, k = starts[u], starts[u + 1] - starts[u]
                     expected = seconds[v, m]
                     for outcome in range(1 << k):
                         chance, after = 1.0, base
                         for i in range(k):
-                            s = view_slots[first + i]
+                            s = viewed[first + i]
                             if (outcome >> i) & 1:
                                 chance *= free[s, aged[s]]
                                 after += (1 - aged[s]) * powers[s]

@@ -95,14 +95,8 @@ class Line:
     def scenario(self):
         odds, problem = math.log(self.q / (1.0 - self.q)), self.problem()
         lasting = OccupancyProcess.from_demand(np.full(self.n_slots, odds), np.zeros(WEEK_HOURS), FOREVER_S)
-        return Scenario(
-            name="line",
-            lot=problem.lot,
-            v_walk=problem.v_walk,
-            v_drive=problem.v_drive,
-            sensor_model=problem.sensor_model,
-            occupancy=lasting,
-        )
+        fields = {name: getattr(problem, name) for name in ("lot", "v_walk", "v_drive", "sensor_model")}
+        return Scenario(name="line", occupancy=lasting, **fields)
 
 
 def free_slots_taken(agent, problem, p_occupied, asked):
@@ -176,17 +170,13 @@ def thresholds():
     for q, ratio in [*((q, EQUAL_COSTS) for q in CHANCES), (0.9, THESIS_SPEEDS)]:
         line = Line.long(q, ratio)
         name = f"q = {q:g}, {'a = b' if ratio == EQUAL_COSTS else '4 and 10 km/h'}:"
-        far = q > 0.97
         best = {"failure_s": line.best_failure_s, "gamma": 1.0}
-        made.append(
-            Statement(
-                f"{name} belief, mean cost over the least", 1.0, partial(cost_ratio, line), 0.002, slow=True
-            )
-            if far
-            else Statement(
-                f"{name} belief, threshold", line.threshold, partial(threshold, "belief", line, day=False)
-            )
-        )
+        if q > 0.97:
+            case = f"{name} belief, mean cost over the least"
+            made.append(Statement(case, 1.0, partial(cost_ratio, line), 0.002, slow=True))
+        else:
+            found = partial(threshold, "belief", line, day=False)
+            made.append(Statement(f"{name} belief, threshold", line.threshold, found))
         case = f"{name} mdp at its best failure cost, threshold"
         made.append(Statement(case, line.threshold, partial(threshold, "mdp", line, **best)))
     usual = math.floor(10.0 * 0.9 / 0.1 / line.before_s)

@@ -123,21 +123,13 @@ def ordered_entry(policy=ORDERED_ENTRY):
     of Krapivsky and Redner (2019).
     """
     n, load = ENTRY_SLOTS, ENTRY_LOAD
-    return [
-        *(
-            Statement(
-                f"A = {load:g}: slot {k} is taken",
-                load * (erlang_b(k - 1, load) - erlang_b(k, load)),
-                lambda k=k: entries(policy)[:, k - 1],
-            )
-            for k in (1, 2, 3, 5, 8)
-        ),
-        Statement(
-            f"A = {load:g}: mean index of a car's slot",
-            sum(erlang_b(k, load) for k in range(n)),
-            lambda: entries(policy)[:, n],
-        ),
-    ]
+    made = []
+    for k in (1, 2, 3, 5, 8):
+        carried = load * (erlang_b(k - 1, load) - erlang_b(k, load))
+        case = f"A = {load:g}: slot {k} is taken"
+        made.append(Statement(case, carried, lambda k=k: entries(policy)[:, k - 1]))
+    case, mean = f"A = {load:g}: mean index of a car's slot", sum(erlang_b(k, load) for k in range(n))
+    return [*made, Statement(case, mean, lambda: entries(policy)[:, n])]
 
 
 @closed_form("The law of the stay", "Sevast'yanov 1957; Little 1961, M/G/∞")
@@ -150,22 +142,15 @@ def stays():
     lot = grid_lot(4, 15)
     wide = lane(1).replace(lot=lot, occupancy=lane(lot.n_slots).occupancy)
     small = 5.0 * (1.0 - erlang_b(5, 5.0))
-    return [
-        Statement(
-            f"{slots} slots, A = {load:g}, stays {law}: mean number taken, {policy.name}", expected, found
-        )
-        for law, stay in LAWS.items()
-        for slots, load, expected, policy, found in (
-            (
-                5,
-                5.0,
-                small,
-                ORDERED_ENTRY,
-                Queue(lane(5), ORDERED_ENTRY, 5.0, 70, 30.0, 300.0, stay).mean_taken,
-            ),
-            (60, 30.0, 30.0, GREEDY, Queue(wide, GREEDY, 30.0, 12, 30.0, 100.0, stay).mean_taken),
-        )
-    ]
+    made = []
+    for law, stay in LAWS.items():
+        for slots, expected, queue in (
+            (5, small, Queue(lane(5), ORDERED_ENTRY, 5.0, 70, 30.0, 300.0, stay)),
+            (60, 30.0, Queue(wide, GREEDY, 30.0, 12, 30.0, 100.0, stay)),
+        ):
+            case = f"{slots} slots, A = {queue.load:g}, stays {law}: mean number taken, {queue.policy.name}"
+            made.append(Statement(case, expected, queue.mean_taken))
+    return made
 
 
 @closed_form("Cars turned away", "Erlang 1917")
@@ -261,24 +246,15 @@ def strategies():
     it is full, a loss system again, so exactly one of its slots is free with probability \((m/A)\,B(m, A)\). With
     \(m = \tau A\) and \(A \to \infty\) this is \(\tau(1-\tau)\), greatest at \(\tau = \frac12\).
     """
-    meek = [
-        Statement(
-            f"meek drivers, A = {load:g}: the slot at the goal is taken",
-            load * math.exp(-load),
-            partial(
-                Queue(lane(200), MEEK, load, 100, 15.0, 800.0).samples, lambda run: run.mean_parked(200)[-1]
-            ),
-        )
-        for load in (0.5, 1.0, 2.0)
-    ]
-    return meek + [
-        Statement(
-            f"threshold {tau:g}, A = {ZONE_LOAD}: gets the best slot of the zone",
-            tau * erlang_b(round(tau * ZONE_LOAD), ZONE_LOAD),
-            partial(
-                Queue(lane(ZONE_SLOTS), policy, ZONE_LOAD, 12, 15.0, 100.0).samples,
-                lambda run: (run.since["n_moves"] == _BEST).mean(),
-            ),
-        )
-        for tau, policy in THRESHOLDS.items()
-    ]
+    made = []
+    for load in (0.5, 1.0, 2.0):
+        queue = Queue(lane(200), MEEK, load, 100, 15.0, 800.0)
+        found = partial(queue.samples, lambda run: run.mean_parked(200)[-1])
+        case = f"meek drivers, A = {load:g}: the slot at the goal is taken"
+        made.append(Statement(case, load * math.exp(-load), found))
+    for tau, policy in THRESHOLDS.items():
+        queue = Queue(lane(ZONE_SLOTS), policy, ZONE_LOAD, 12, 15.0, 100.0)
+        found = partial(queue.samples, lambda run: (run.since["n_moves"] == _BEST).mean())
+        case = f"threshold {tau:g}, A = {ZONE_LOAD}: gets the best slot of the zone"
+        made.append(Statement(case, tau * erlang_b(round(tau * ZONE_LOAD), ZONE_LOAD), found))
+    return made

@@ -65,9 +65,8 @@ def test_one_slot_is_one_look():
     solution = solved(scenario, 20.0, (0.8,))
     entry = int(scenario.lot.entry_vertices[0])
     drive = float(scenario.move_s[entry][scenario.lot.neighbors[entry] >= 0].min())
-    assert solution.expected_s(entry) == pytest.approx(
-        drive + 0.2 * scenario.walk_s[0] + 0.8 * 50.0, abs=0.01
-    )
+    expected = drive + 0.2 * scenario.walk_s[0] + 0.8 * 50.0
+    assert solution.expected_s(entry) == pytest.approx(expected, abs=0.01)
 
 
 def test_slots_that_hardly_change_give_the_static_optimum():

@@ -134,10 +134,8 @@ def settle(scenario, first, per_hour, stay, days, slow_s):
         policy.data.record["share"] = share
         fleet.reset(0, day)
         fleet.run(until=fleet.begin + DAY_S)
-        cars = fleet.cars
-        cars = cars[
-            (cars["arrival"] >= fleet.begin + WARM_UP_S) & (cars["slot"] >= 0) & (cars["ended_at"] < np.inf)
-        ]
+        counts = (fleet.cars["arrival"] >= fleet.begin + WARM_UP_S) & (fleet.cars["slot"] >= 0)
+        cars = fleet.cars[counts & (fleet.cars["ended_at"] < np.inf)]
         chose = cars["slot"] == first if first != _KERB else cars["slot"] != second
         cost_s = [cars["total_s"][which].mean() for which in (chose, ~chose)]
         days_so_far.append((share, cars["drive_s"][chose].mean()))
@@ -158,6 +156,7 @@ def cruising():
     angle = np.linspace(0.0, 2.0 * np.pi, 61)
     ring = 25.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     slots, _ = kerb_rows(ring[:-1], ring[1:], np.zeros(60, bool), (2.5, 2.0))
+    rules = {name: Zone(name, Price(per_hour=price)) for name, price in (("kerb", kerb), ("garage", dear))}
     scenario = beside(
         lane(1).replace(v_drive=5.0, value_of_time=value, stay_s=stay_s),
         Facility("garage", "garage", "garage", capacity=HUGE, xy=tuple(ring[0].tolist())),
@@ -167,10 +166,7 @@ def cruising():
         lanes=(Lane(ring, oneway=True),),
         entries=ring[:1],
         goals=np.zeros((1, 2)),
-        zone_rules={
-            "kerb": Zone("kerb", Price(per_hour=kerb)),
-            "garage": Zone("garage", Price(per_hour=dear)),
-        },
+        zone_rules=rules,
     )
     per_hour = 1.6 * len(slots) * HOUR_S / stay_s
     return [
@@ -234,9 +230,8 @@ def walk_time_s(problem, taken):
 def renewed(taken):
     lot = city_lot(400, 0)
     odds = np.full(lot.n_slots, np.log(taken / (1.0 - taken)))
-    scenario = make_scenario(lot).replace(
-        occupancy=OccupancyProcess.from_demand(odds, np.zeros(WEEK_HOURS), 1.0)
-    )
+    occupancy = OccupancyProcess.from_demand(odds, np.zeros(WEEK_HOURS), 1.0)
+    scenario = make_scenario(lot).replace(occupancy=occupancy)
     return scenario.replace(sensor_model=dataclasses.replace(scenario.sensor_model, view_range=0.0))
 
 
@@ -244,9 +239,8 @@ def walks_s(taken, cars=1000):
     drivers = (DriverKind(policy=CompiledPolicy("walk", decide_walk)),)
     demand = Demand(Headways(cars, 1.0), ConstantTime(1e-3))
     limits = {"max_steps": 10**6, "leave_full_lot": False}
-    return driven(Fleet(renewed(taken), demand, background="process", drivers=drivers, **limits), 0).cars[
-        "drive_s"
-    ]
+    fleet = Fleet(renewed(taken), demand, background="process", drivers=drivers, **limits)
+    return driven(fleet, 0).cars["drive_s"]
 
 
 @closed_form(
