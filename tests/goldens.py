@@ -111,9 +111,7 @@ def run(name: str, folder: Path) -> dict[str, Any]:
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
     for words in CASES[name]:
         command = [sys.executable, "-m", "parkenv", *words.format(data=DATA).split()]
-        done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, check=False
-        )
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"{words}\n{done.stderr[-2000:]}")
     results: dict[str, Any] = {}
@@ -123,18 +121,14 @@ def run(name: str, folder: Path) -> dict[str, Any]:
             continue
         if path.name == "summary.json":
             summary = _lasting(json.loads(path.read_text()))
-            long = len(json.dumps(summary)) > LONG
-            results[key] = (
-                {name: _hash(json.dumps(part).encode()) for name, part in summary.items()}
-                if long
-                else summary
-            )
+            if len(json.dumps(summary)) > LONG:
+                summary = {part: _hash(json.dumps(its).encode()) for part, its in summary.items()}
+            results[key] = summary
         else:
             content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
             content = content.replace(str(ROOT).encode(), b"")
-            if path.suffix == ".csv" and any(
-                map(VOLATILE.match, content.decode().split("\n")[0].strip().split(","))
-            ):
+            columns = content.split(b"\n")[0].decode(errors="replace").strip().split(",")
+            if path.suffix == ".csv" and any(map(VOLATILE.match, columns)):
                 rows = [_lasting(row) for row in csv.DictReader(io.StringIO(content.decode()))]
                 content = json.dumps(rows).encode()
             results[key] = _hash(content)
@@ -165,9 +159,8 @@ def _write_inputs(folder: Path) -> None:
 
 def main() -> int:
     """Check or record; return the number of goldens that differ."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=form)
     parser.add_argument("action", choices=("check", "record"))
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(CASES))
     arguments = parser.parse_args()
@@ -178,9 +171,8 @@ def main() -> int:
             results = run(name, Path(folder))
         if arguments.action == "record":
             goldens[name] = {"commands": CASES[name], "results": results}
-            cases = ",\n".join(
-                f"{json.dumps(case)}: {json.dumps(goldens[case])}" for case in CASES if case in goldens
-            )
+            kept = {case: goldens[case] for case in CASES if case in goldens}
+            cases = ",\n".join(f"{json.dumps(case)}: {json.dumps(its)}" for case, its in kept.items())
             GOLDENS.write_text(f"{{\n{cases}\n}}\n")
             print(f"{name}: recorded", flush=True)
             continue

@@ -34,10 +34,9 @@ def small_lot(seed: int, shapes=SHAPES):
     plain = grid_lot(*shapes[seed % len(shapes)], pitch=PITCHES[seed // 6 % 3])
     west, south, east, north = plain.bounds()
     goal = [[rng.uniform(west - 10.0, east + 10.0), rng.uniform(south - 10.0, north + 10.0)]]
+    changes = {"goals": np.array(goal), "slot_parking_cost_s": prices(plain, seed)}
     problem = SearchProblem(
-        lot=ParkingLot(
-            **{**features(plain), "goals": np.array(goal), "slot_parking_cost_s": prices(plain, seed)}
-        ),
+        lot=ParkingLot(**features(plain) | changes),
         v_drive=rng.uniform(1.5, 4.0),
         v_walk=rng.uniform(0.8, 1.6),
         give_up_s=300.0,

@@ -28,10 +28,8 @@ def make_small(patch):
 
 def search_training(algorithm, steps, every, places, held_out=(), episodes=4, **fields):
     """A training in places that are no files."""
-    spec = TrainingSpec(
-        algorithm=algorithm, steps=steps, evaluate_every=every, evaluation_episodes=episodes, **fields
-    )
-    training = Training(spec)
+    options = {"evaluate_every": every, "evaluation_episodes": episodes, **fields}
+    training = Training(TrainingSpec(algorithm=algorithm, steps=steps, **options))
     training.sides = places, held_out
     return training
 

@@ -14,8 +14,7 @@ def change_rows(folder, change, file="results.sqlite"):
             database.execute("DELETE FROM row WHERE rowid = ?", (number,))
         else:
             new = json.dumps(row)
-            database.execute(
-                "UPDATE row SET value = ?, crc32 = ? WHERE rowid = ?", (new, crc32(new.encode()), number)
-            )
+            changed = new, crc32(new.encode()), number
+            database.execute("UPDATE row SET value = ?, crc32 = ? WHERE rowid = ?", changed)
     database.commit()
     database.close()

@@ -101,9 +101,8 @@ def sample(lot, weather, seed):
             chosen = views & (near == (rng.random() < 0.5))
             if chosen.any():
                 weight = chosen.sum() / views.sum() * (1.0 if left[slot] <= LAMPS_S else 1.0 / 0.3)
-                moments.append(
-                    (time, int(rng.choice(np.flatnonzero(chosen))), weight * (np.arange(n) == slot))
-                )
+                vertex = int(rng.choice(np.flatnonzero(chosen)))
+                moments.append((time, vertex, weight * (np.arange(n) == slot)))
         if len(moments) >= N_LEAVING:
             break
     moments += [(time, int(rng.integers(n)), ~scenes.left(time)[1] * 1.0) for time in times[:N_ELSEWHERE]]

@@ -148,13 +148,11 @@ def street():
     courtyard_side = np.array([0, 0, 1, 3, 2, 2])  # south, east, north or west of each block
     each = np.arange(len(blocks))
     gate = (blocks[each, courtyard_side] + blocks[each, (courtyard_side + 1) % 4]) / 2
-    ways_in = shapely.buffer(
-        shapely.linestrings(np.stack([gate, blocks.mean(axis=1)], axis=1)), 2.5, cap_style="flat"
-    )
+    ways = shapely.linestrings(np.stack([gate, blocks.mean(axis=1)], axis=1))
+    ways_in = shapely.buffer(ways, 2.5, cap_style="flat")
     block = shapely.polygons(blocks)
-    front, back = (
-        shapely.buffer(block, -d, join_style="mitre") for d in (BUILDING_SETBACK, BUILDING_SETBACK + 11.0)
-    )
+    depths = (BUILDING_SETBACK, BUILDING_SETBACK + 11.0)
+    front, back = (shapely.buffer(block, -depth, join_style="mitre") for depth in depths)
     houses = shapely.normalize(shapely.difference(front, shapely.union(back, ways_in)))
     walls = [shapely.get_coordinates(house) for house in np.asarray(houses)]
 
@@ -172,9 +170,8 @@ def mini():
     return lot("mini", rows, [([(-9.0, 0.0), (17.0, 0.0)], False)], [(-9.0, 0.0)], [(25.0, 0.0)], walls)
 
 
-LOTS = {
-    make.__name__: make for make in (campus, jam, street, mini, town, runpy.run_path(str(STREETS))["kerbs"])
-}
+MAKERS = (campus, jam, street, mini, town, runpy.run_path(str(STREETS))["kerbs"])
+LOTS = {make.__name__: make for make in MAKERS}
 
 
 if __name__ == "__main__":

@@ -52,10 +52,8 @@ CAR_PARKS = (("Market square", (4, 2), "market"), ("Town hall", (5, 6), "ring"),
 BAYS = (("disabled", 17, 3), ("charging", 23, 5), ("delivery", 29, 11))
 """Zone of single bays in the centre and the ring: each so-many-th slot, from the so-many-th on."""
 
-PURPOSES, COMING_FAR = (
-    ("residents", "commuters", "shoppers", "visitors", "deliveries"),
-    ("commuters", "visitors"),
-)
+PURPOSES = ("residents", "commuters", "shoppers", "visitors", "deliveries")
+COMING_FAR = ("commuters", "visitors")
 EVEN, FAR = (3.0, 2.0, 2.0, 1.0, 3.0, 2.0, 2.0, 1.0), (5.0, 2.0, 2.0, 1.0, 5.0, 1.0, 2.0, 1.0)
 """Weights of the eight entries: most cars come from the west and the south."""
 
@@ -73,10 +71,8 @@ def town():
     facilities += [Facility(str(part.facility[0]), "lot", str(part.zone[0])) for part in car_parks]
     for name, capacity, block, known in GARAGES:
         facilities.append(_garage(name, capacity, blocks[block], known))
-    station = blocks[1, 1].mean(axis=0)
-    facilities.append(
-        Facility("Station car park", "lot", "station", 150, tuple(station), 6.0, (20.0, 60.0), "sign")
-    )
+    station = tuple(blocks[1, 1].mean(axis=0))
+    facilities.append(Facility("Station car park", "lot", "station", 150, station, 6.0, (20.0, 60.0), "sign"))
     goals, goal_weights = _goals(blocks)
     built = np.ones(blocks.shape[:2], np.bool_)
     for _, at, _ in CAR_PARKS:
@@ -194,11 +190,9 @@ def _join(lanes, at, corners):
 
 def _garage(name, capacity, block, known):
     """Return a garage that is entered from the south side of its block."""
-    xy = (block[0] + block[1]) / 2 + np.array([0.0, BUILDING_SETBACK])
+    xy = tuple(np.round((block[0] + block[1]) / 2 + np.array([0.0, BUILDING_SETBACK]), 3))
     delay_s = 60.0 if known == "live" else 0.0
-    return Facility(
-        name, "garage", "garage", capacity, tuple(np.round(xy, 3)), 8.0, (40.0, 150.0), known, delay_s
-    )
+    return Facility(name, "garage", "garage", capacity, xy, 8.0, (40.0, 150.0), known, delay_s)
 
 
 def _goals(blocks):
