@@ -234,6 +234,18 @@ def test_a_comparison_needs_no_folder_and_knows_its_fields():
         parkenv.compare(episods=3)
 
 
+def test_the_command_lets_ctrl_c_end_it_before_it_imports_its_modules():
+    program = (
+        "import os, signal, sys, types; from parkenv.__main__ import main\n"
+        "assert 'parkenv.cli' not in sys.modules\n"
+        "command = types.ModuleType('parkenv.cli')\n"
+        "command.main = lambda: os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.modules['parkenv.cli'] = command; signal.signal(signal.SIGINT, signal.default_int_handler); main()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 def test_what_needs_an_extra_says_so_in_a_line(monkeypatch, tmp_path):
     for module in ("pyproj", "yaml", "sklearn.cluster", "osmium"):
         monkeypatch.setitem(sys.modules, module, None)

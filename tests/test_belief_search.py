@@ -9,7 +9,7 @@ import pytest
 from expected_time import expected_time, optimum_s
 from small_lots import cut_in_two, features, full_lot, lasting, small_lot
 
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel, make_scenario
+from parkenv import OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.engine.fleet import DriverKind, Fleet
@@ -30,8 +30,6 @@ from planners.belief.planning_graph import MOST_STOPS
 
 LOTS = range(0, 324, 13)
 """Thirteen divides none of the rounds of slot chances, pitch, view and shape: they are mixed as in all 324."""
-WRONG = [("belief", "budget_ms", 0.0), ("belief", "doubt", 1.1), ("belief", "event", -0.1)]
-WRONG += [("belief-rivals", "arrivals_per_hour", rate) for rate in (-1.0, np.inf, np.nan)]
 LOT = grid_lot(1, 3, pitch=12.0)
 
 
@@ -198,12 +196,6 @@ def test_it_expects_slots_that_it_saw_taken_to_come_free():
 def test_it_does_not_circle_among_taken_slots(seed):
     """In lots 98 and 99 % full against the forecast: another look at them is no news that begins a plan anew."""
     assert search(make_scenario("jam"), seed)["total_s"] < 400.0
-
-
-@pytest.mark.parametrize(("agent", "name", "value"), WRONG)
-def test_bad_options_are_refused(agent, name, value):
-    with pytest.raises(InputError, match=f"{name} is {value}"):
-        make_agent(agent, make_scenario("mini"), **{name: value})
 
 
 def hidden_lots(name, seen_rate, occupancy=None):

@@ -40,12 +40,6 @@ def test_nearness_falls_by_rank_from_one_to_minus_one():
     assert nearness([7.0]).tolist() == [1.0]
 
 
-@pytest.mark.parametrize("value", [-0.1, 5.1, float("nan"), "0.8", None, True])
-def test_sizes_out_of_range_are_refused(value):
-    with pytest.raises(InputError, match=r"slope is .* want a "):
-        DayError(0.8, value)
-
-
 def test_a_process_with_a_slope_needs_the_nearness_of_its_slots():
     process = OccupancyProcess.from_demand(np.zeros(3), np.zeros(168))
     with pytest.raises(InputError, match="nearness is None, want numbers"):

@@ -36,6 +36,8 @@ from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.report import RunFolder
 from parkenv.studies.results import DECISIONS, EPISODES, Results, decision_s
 from parkenv.studies.study import read_study
+from parkenv.studies.training.curve_file import read_curve
+from parkenv.world.occupancy.recorded import read_mapping
 
 MINI = packaged_lot("mini")
 ROOT = Path(__file__).parents[1] / "parkenv"
@@ -274,6 +276,11 @@ READERS = {
     "file.yml": read_yaml,
     "track.gpx": read_track,
     "poses.csv": read_track,
+    "log.csv": OccupancyLog.read,
+    "mapping.csv": lambda path: read_mapping(path, ["A", "B"], ("s0", "s1", "s2", "s3"), "the log"),
+    "sight.json": SensorModel.from_file,
+    "calibrated.json": Calibration.from_file,
+    "curve.csv": read_curve,
     **dict.fromkeys(("scene.csv", "scene.json", "scene.toml"), read_scene),
 }
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from parkenv import InputError
 from parkenv.perception.hog import CELL, ORIENTATIONS, Descriptor, cell_histograms, correlate
 
 
@@ -70,17 +69,3 @@ def test_a_window_in_the_middle_is_the_crops_own_description():
     # Cells at the border have neighbours beyond it, which are only guessed from the crop.
     np.testing.assert_allclose(window[1:-1, :, 1:-1], alone[1:-1, :, 1:-1], atol=1e-5)
     np.testing.assert_allclose(window, alone, atol=0.05)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Descriptor(100, 64), "width is 100 px, want a multiple of 8"),
-        (lambda: Descriptor(128, 64, "l1"), "normalization is 'l1'"),
-        (lambda: Descriptor().describe(np.zeros((64, 64), np.uint8)), r"crop is \(64, 64\), want"),
-        (lambda: cell_histograms(np.zeros((8, 8), np.float32)), "float32, want"),
-    ],
-)
-def test_bad_input_is_named(make, message):
-    with pytest.raises(InputError, match=message):
-        make()

@@ -194,20 +194,6 @@ def test_good_tables_are_read(tmp_path):
     assert read_curve(tmp_path / "none.csv") == []
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "wanted"),
-    [
-        ("steps", "1e5", "a whole number of at most 15 digits"),
-        ("total_s", "fast", "a number, at most 1e+12, or nan"),
-    ],
-)
-def test_a_wrong_value_is_named(tmp_path, column, value, wanted):
-    path = write(tmp_path / "table.csv", EVALUATION | {column: value})
-    with pytest.raises(InputError) as refused:
-        read_curve(path)
-    assert str(refused.value) == f"{path}: line 2: {column} is {value!r}, want {wanted}"
-
-
 @given(st.lists(st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="\0")), min_size=1))
 @example(["=1+1", "'=1+1", "''=1", "+A1", "-cmd", "@x", "-5", "+1e3", "'quoted'", "", "\tx", "\rx", "a=1"])
 def test_texts_are_no_formulas_in_spreadsheets_and_are_read_as_they_were(texts):

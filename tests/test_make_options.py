@@ -15,8 +15,20 @@ from lot_checks import refusal
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 from test_lot import ONE_SLOT
+from test_occupancy import KEY, constant_process
+from test_turns import blocks
 
-from parkenv import InputError, lot_v0, make_agent, make_scenario, simulate
+from parkenv import (
+    ArrivalWindow,
+    InputError,
+    OccupancyLog,
+    OccupancyProcess,
+    SensorModel,
+    lot_v0,
+    make_agent,
+    make_scenario,
+    simulate,
+)
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.envs import flat_ids
@@ -24,7 +36,11 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import grid_lot
+from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.survey import SurveySettings
+from parkenv.perception.detector import Detections
+from parkenv.perception.hog import Descriptor, cell_histograms
+from parkenv.perception.range_scan import scan_from_laser
 from parkenv.world.cost_terms import REWARD_TERMS
 from parkenv.world.demand import (
     ConstantTime,
@@ -34,17 +50,21 @@ from parkenv.world.demand import (
     ListedArrivals,
     PoissonArrivals,
 )
-from parkenv.world.lot import Lane, ParkingLot
+from parkenv.world.lot import Lane, ParkingLot, Turn
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.fit import fit_constant_rates
+from parkenv.world.occupancy.process import Arrival
 from sim_sensors import SensorError, SlotLot
 from sim_sensors.camera.image_sensor import ImageSensor
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.movers import Movers
-from sim_sensors.rig import Mount, SensorRig
+from sim_sensors.rig import Mount, SensorRig, poses_along
 from sim_sensors.scene import Scene
 from sim_sensors.slot_scenes import ParkingManners
 from sim_sensors.surroundings import Surroundings
+from sim_sensors.vehicles.vehicle import VehicleModel
 
 SCALE, N = 0.01, 4
 
@@ -290,6 +310,42 @@ TAKERS = {
     "camera": PinholeCamera,
     "stereo": StereoCamera,
     "sensor": ImageSensor,
+    "sight": SensorModel.named,
+    "pose noise": PoseNoise,
+    "rig": SensorRig,
+    "two lasers": lambda name: SensorRig(lasers=((name, LaserScanner(), Mount()),) * 2),
+    "mount": Mount,
+    "poses": poses_along,
+    "car": lambda **changes: VehicleModel(**SUV | changes),
+    "hog": Descriptor,
+    "crop": lambda *shape: Descriptor().describe(np.zeros(shape, np.uint8)),
+    "cells": lambda kind: cell_histograms(np.zeros((8, 8), kind)),
+    "scan": lambda n, away: scan_from_laser(
+        LaserScanner(), Mount(z=0.5), np.zeros(3), np.full(n, away, "f4")
+    ),
+    "detections": lambda **changes: Detections(**TWO_BOXES | changes),
+    "local": lambda k: LocalObservation(gym.make("parkenv/Search-v2", scenario="mini"), k),
+    "turn": lambda *points: blocks([Turn(np.array(points, float))]),
+    "window": ArrivalWindow,
+    "hours": ArrivalWindow.parse,
+    "day error": DayError,
+    "fuller": lambda arrival, level: constant_process(2, arrival, 1e-4).at_mean_occupancy(level, 0.0),
+    "of demand": lambda slots, *stay_s: OccupancyProcess.from_demand(slots, np.zeros(168), *stay_s),
+    "look": lambda begin, time: (
+        constant_process(2, 1e-4, 1e-4).world(KEY, Arrival(begin)).occupied([0], time)
+    ),
+    "log": lambda **changes: OccupancyLog(**ONE_LOOK | changes),
+    "looks": lambda dt, states: fit_constant_rates(dt, states, states),
+}
+SUV = {"body": "suv", "segment": "JC", "size": (4.5, 1.85, 1.65), "paint": (9, 9, 9), "seed": 1}
+TWO_BOXES = {"boxes": [[0, 0, 1, 1], [2, 2, 4, 4]], "probability": [0.5, 0.6]}
+ONE_LOOK = {
+    "slot_ids": ["a"],
+    "days": ["2024-01-01"],
+    "slot": [0],
+    "day": [0],
+    "second": [1.0],
+    "occupied": [1],
 }
 BAD = json.loads(Path(__file__).with_name("bad_arguments.json").read_text(encoding="utf-8"))
 """Who takes arguments, wrong ones, and what is said of them."""

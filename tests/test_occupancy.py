@@ -203,27 +203,6 @@ def test_window_parse():
     assert ArrivalWindow.parse("10:00-10:00", "weekend").draw_second(KEY) == 10 * HOUR_S
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: ArrivalWindow.parse("8-13"), "arrival hours are '8-13', want HH:MM-HH:MM"),
-        (lambda: ArrivalWindow.parse("25:00-26:00"), "start_s is 90000.0"),
-        (lambda: ArrivalWindow.parse("08:00-09:00", "monday"), "arrival days are 'monday', want weekdays"),
-        (lambda: ArrivalWindow(weekdays=()), "weekdays is"),
-        (lambda: ArrivalWindow(start_s=math.nan), "start_s is nan"),
-        (lambda: busy_process().at_mean_occupancy(1.0, 0.0), "is 1.0, want a finite number above 0"),
-        (lambda: constant_process(2, 0.0, 1e-4).at_mean_occupancy(0.5, 0.0), "cannot be reached by scaling"),
-        (lambda: OccupancyProcess.from_demand([1.0], np.zeros(168), -1.0), "mean_stay_s is -1.0"),
-        (lambda: OccupancyProcess.from_demand([math.nan], np.zeros(168)), "attraction: want finite logits"),
-        (lambda: busy_process().world(KEY, NINE).occupied([0], 0.0), "time is 0.0, want finite seconds"),
-        (lambda: busy_process().world(KEY, Arrival(math.nan)), "Arrival.time is nan"),
-    ],
-)
-def test_bad_input_is_refused_in_words(make, message):
-    with pytest.raises(InputError, match=message):
-        make()
-
-
 @pytest.mark.parametrize("slot", [-1, 20])
 def test_a_slot_that_is_not_there_is_an_index_error(slot):
     with pytest.raises(IndexError, match="slot index out of range"):

@@ -60,19 +60,6 @@ def test_constant_rates_solve_the_closed_form_for_equal_gaps():
     assert departure == pytest.approx(total * 4 / 7, rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("dt", "start", "message"),
-    [
-        ([], [], r"intervals have shapes \(0,\)"),
-        ([1.0, 2.0], [1], "intervals have shapes"),
-        ([0.0], [1], "intervals: dt: want finite seconds > 0"),
-    ],
-)
-def test_bad_looks_are_refused(dt, start, message):
-    with pytest.raises(InputError, match=message):
-        fit_constant_rates(dt, start, start)
-
-
 def random_intervals(k, n):
     rng = np.random.default_rng(3)
     start = rng.uniform(0, 20, k) * HOUR_S

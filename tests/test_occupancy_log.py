@@ -83,44 +83,6 @@ def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tm
     assert log.occupied.tolist() == [False, False]
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "has the columns '', want bay with arrival and departure, with since and state, or"),
-        (HEADER, "has no states of bays, want some"),
-        ("datetime,slot,colour\n", "has the columns 'datetime, slot, colour', want bay .*; see --columns"),
-        (HEADER + "2024-01-01 07:00,1,a,sunny,2\n", "1 of 1 rows are .*: line 2: the state is '2', want"),
-        (HEADER + "yesterday,1,a,sunny,1\n", "1 of 1 rows are unreadable: line 2: a day without a time"),
-        (HEADER + "2024-01-01 07:00+01:00,1,a,sunny,1\n", "has times .* with an offset, want --timezone"),
-        (HEADER + "2024-01-01 07:00,1,,sunny,1\n", "1 of 1 rows are unreadable: line 2: the bay is ''"),
-        (HEADER + "2024-01-01 07:00,1,a\n", "line 2: has 3 fields, want 5"),
-        (HEADER + "\0\udcff", "not UTF-8 text"),
-    ],
-)
-def test_a_bad_log_is_refused_by_line(tmp_path, text, message):
-    path = tmp_path / "log.csv"
-    path.write_bytes(text.encode(errors="surrogateescape"))
-    with pytest.raises(InputError, match=rf"log\.csv: {message}"):
-        OccupancyLog.read(path)
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"slot": [4]}, "slot: want indices from 0 to 0"),
-        ({"second": [86_400.0]}, "second: want seconds of the day"),
-        ({"second": [1.0, 2.0]}, "of one length"),
-        ({"days": ("1 May",)}, "days: want different ISO dates"),
-        ({"max_gap_s": 0.0}, "max_gap_s is 0.0"),
-        ({"slot": []}, "no observations"),
-    ],
-)
-def test_a_bad_log_object_is_refused(fields, message):
-    good = {"slot_ids": ["a"], "days": MONDAYS[:1], "slot": [0], "day": [0], "second": [1.0], "occupied": [1]}
-    with pytest.raises(InputError, match=message):
-        OccupancyLog(**(good | fields))
-
-
 def replay_of(seconds, states):
     zeros = np.zeros(len(seconds), int)
     log = OccupancyLog(("a",), MONDAYS[:1], zeros, zeros, seconds, states)
@@ -288,20 +250,6 @@ def test_a_mapping_is_read_and_used(tmp_path):
     mapped = RecordedOccupancy(log, np.array([3.0, 2.0, 1.0]), mapping).mapped_log(MONDAYS[0])
     monday, next_monday = (log.days.index(day) * 4 for day in MONDAYS[:2])
     assert mapped.record.tolist() == [monday, next_monday + 3, monday + 3]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("slot_id,log_slot_id\nZ,s0\n", "line 2: slot_id is 'Z', want a slot of the lot"),
-        ("slot_id,log_slot_id\nA,s9\n", "log_slot_id: none is among the 4 names of the log, .* is 's0'"),
-        ("slot_id,log_slot_id\nA,s0\nA,s1\n", "line 3: slot_id: 'A' a second time"),
-        ("slot_id,log\nA,s0\n", "has the columns 'slot_id, log', want slot_id,log_slot_id"),
-    ],
-)
-def test_a_bad_mapping_is_refused(tmp_path, text, message):
-    with pytest.raises(InputError, match=rf"mapping\.csv: {message}"):
-        read_mapping(write(tmp_path, text, "mapping.csv"), ["A", "B"], ("s0", "s1", "s2", "s3"), "the log")
 
 
 @pytest.fixture(scope="module")

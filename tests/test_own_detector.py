@@ -128,24 +128,6 @@ def test_detectors_are_made_by_name(tmp_path):
             make_detector(wrong)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"boxes": np.zeros((2, 3))}, r"boxes has shape \(2, 3\), want \(2, 4\)"),
-        ({"boxes": [[0, 0, 1, 1], [5, 5, 4, 9]]}, r"boxes\[1\] is \[5.0, 5.0, 4.0, 9.0\], want left < right"),
-        ({"probability": [0.5, 1.5]}, "want 0 to 1"),
-        ({"probability": [0.5, np.nan]}, "finite"),
-        ({"end_on": [True]}, r"end_on has shape \(1,\), want \(2,\)"),
-        ({"view": [2, 3]}, r"view is \[2, 3\], want 2 of END 0, OBLIQUE 1, SIDE 2"),
-        ({"visible_fraction": [0.5, 1.5]}, r"visible_fraction is \[0.5, 1.5\], want 2 of 0 to 1 or NaN"),
-    ],
-)
-def test_detections_are_checked(wrong, message):
-    good = {"boxes": [[0, 0, 1, 1], [2, 2, 4, 4]], "probability": [0.5, 0.6]}
-    with pytest.raises(InputError, match=message):
-        Detections(**{**good, **wrong})
-
-
 def test_what_a_detector_does_not_know_is_side_or_end_and_nan():
     found = Detections([[0, 0, 1, 1], [2, 2, 4, 4]], [0.5, 0.6], [False, True])
     assert found.view.tolist() == [View.SIDE, View.END]

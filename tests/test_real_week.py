@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.special import expit, logit
 
-from parkenv.errors import InputError
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 from parkenv.lots import grid_lot, packaged_lot
@@ -44,12 +43,6 @@ def test_a_scenario_file_says_how_full(tmp_path):
     assert made.occupancy.marginal(noon).mean() == pytest.approx(0.64, abs=1e-4)
     spec = ScenarioSpec.parse({"lot": "mini", "occupancy": "real-week"}, "test")
     assert spec.occupancy.real_week is not None
-    for occupancy, message in (
-        ({"real_week": {}, "typical": {}}, "at most one of typical, real_week"),
-        ({"real_week": {"fuller_than": 1.5}}, r"occupancy\.real_week\.fuller_than is 1\.5"),
-    ):
-        with pytest.raises(InputError, match=message):
-            ScenarioSpec.parse({"lot": "mini", "occupancy": occupancy}, "test")
 
 
 def test_slots_spread_as_in_the_recorded_log():

@@ -6,10 +6,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from command_line import parkenv
 from test_survey import halves
 
-from parkenv import InputError, Traffic, make_scenario
+from parkenv import Traffic, make_scenario
 from parkenv.mapping.odometry import PoseNoise, between, moved
 from parkenv.mapping.scan_matching import ScanMatcher
 from parkenv.mapping.survey import Survey, SurveySettings
@@ -120,16 +119,3 @@ def test_a_survey_knows_where_its_car_was():
     }
     assert len(keys) == 3
     assert result.session.key in keys
-    with pytest.raises(InputError, match="localise is 'gps', want one of none, scan-matching"):
-        SurveySettings(localise="gps")
-
-
-def test_wrong_options_are_answered_in_a_line(tmp_path):
-    for words, said in (
-        ("--odometry-drift 2", "odometry-drift"),
-        ("--localise gps", "--localise is 'gps', want 'none' or 'scan-matching'"),
-    ):
-        done = parkenv(f"survey --scenario mini {words}", "--out", tmp_path / "s")
-        assert done.returncode == 2
-        assert said in done.stderr.replace("_", "-")
-        assert len(done.stderr.strip().splitlines()) == 1

@@ -404,19 +404,3 @@ def test_poses_lie_on_the_path_in_even_steps(points, every):
     length = np.hypot(*np.diff(path, axis=0).T).sum()
     count = length / every
     assert len(poses) == pytest.approx(count, abs=1.01) or len(poses) == math.ceil(count) + 1
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: SensorRig(), "no sensor"),
-        (lambda: SensorRig(lasers=(("a", LaserScanner(), Mount()),) * 2), "'a' is used twice"),
-        (lambda: Mount(z=0.0), "z is 0.0"),
-        (lambda: poses_along([[0, 0]], 1.0), "path has shape"),
-        (lambda: poses_along([[0, 0], [0, 0]], 1.0), "no length"),
-        (lambda: poses_along([[0, 0], [1, 0]], 0.0), "every is 0.0"),
-    ],
-)
-def test_wrong_rigs_are_refused(make, message):
-    with pytest.raises(SensorError, match=message):
-        make()

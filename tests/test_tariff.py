@@ -175,14 +175,6 @@ def test_a_scenario_changes_the_rules_of_zones():
     assert changed.zone_rules["ring"].max_stay_s == 7200.0
     assert changed.zone_rules["ring"].hours == plain.zone_rules["ring"].hours
     assert changed.zone_rules["outer"] == plain.zone_rules["outer"]
-    for wrong, field in (
-        ({"mall": {"price": 1}}, "mall"),
-        ({"ring": {"users": ["nobody"]}}, "nobody"),
-        ({"ring": {"hours": "late"}}, "hours"),
-        ({"ring": {"price": "1 @ late"}}, "price"),
-    ):
-        with pytest.raises(InputError, match=field):
-            make_scenario({"base": "town", "zones": wrong})
 
 
 def empty_lot(lot):

@@ -1,7 +1,6 @@
 """The whole trip: lines along lanes, lane keeping, failed attempts, and calibration of speeds and costs."""
 
 import dataclasses
-import json
 import math
 import re
 from functools import lru_cache
@@ -399,19 +398,9 @@ def test_a_calibration_is_metres_over_seconds_and_what_failed_tries_lose():
         calibrate(rows[:2], MINI, 2.5)
 
 
-def test_a_calibration_comes_back_from_its_file_and_others_are_refused(tmp_path):
+def test_a_calibration_comes_back_from_its_file(tmp_path):
     calibration, file = Calibration("mini", 2.5, 16.0, 15.0, 100, 2.7), tmp_path / "calibrated.json"
     with pytest.raises(InputError, match="No such file"):
         Calibration.from_file(file)
     calibration.to_file(file)
     assert Calibration.from_file(file) == calibration
-    content = json.loads(file.read_text())
-    for changed, message in (
-        (content | {"format": "other"}, "want a calibration"),
-        (content | {"version": 99}, "version is 99, want 1"),
-        (content | {"v_drive": None}, "v_drive is None"),
-        ({name: value for name, value in content.items() if name != "failure_s"}, "has no failure_s"),
-    ):
-        file.write_text(json.dumps(changed))
-        with pytest.raises(InputError, match=message):
-            Calibration.from_file(file)

@@ -94,21 +94,6 @@ def test_the_shortest_way_goes_round_what_is_forbidden(turns, wanted):
     assert metres[0] == pytest.approx(wanted)
 
 
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        ([(-50, 0), (3, 0), (50, 0)], r"turn 0: has no junction or end of a lane at \(3.0, 0.0\) m"),
-        ([(-50, -50), (0, 0), (50, 0)], "turn 0: has no lane by which cars come from"),
-        ([(-50, 0), (0, 0), (50, 50)], "turn 0: has no lane by which cars leave"),
-        ([(-100, 0), (-150, 0), (-100, 0)], r"turn 0: prohibits the last turn that cars may make"),
-        ([(-50, 0), (0, 0)], r"turn points has shape \(2, 2\), want \(3, 2\)"),
-    ],
-)
-def test_a_turn_that_there_is_not_is_refused(points, message):
-    with pytest.raises(InputError, match=message):
-        blocks([Turn(np.array(points, float))])
-
-
 def made(lot, origins, vertices):
     """The turns of a drive, as (comes, at, leaves), by names of arms; the steps are those of one car in their order."""
     n, xy, found = lot.n_slots, lot.vertex_xy, set()

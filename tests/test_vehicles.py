@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPoint, Polygon
 
-from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Material
 from sim_sensors.vehicles.classes import BODIES, BODY_SHARE, PAINTS, SIZE_CLASSES
 from sim_sensors.vehicles.vehicle import COARSE, DETAILED, FOOTPRINT_CORNERS, KNEE_M, VehicleModel
@@ -182,19 +181,3 @@ def test_seeds_give_different_cars_and_paint_changes_nothing_but_colour():
     assert not np.array_equal(red.color, plain.color)
     glass = red.material == Material.GLASS
     assert np.array_equal(red.color[glass], plain.color[glass])
-
-
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"body": "tank"}, "body .*want one of hatchback"),
-        ({"size": (0.0, 1.8, 1.5)}, "size is 0.0, want a length of 3.2 to 6.0 m"),
-        ({"paint": (10, 20, 300)}, "paint"),
-        ({"seed": -1}, "seed .*want an integer"),
-    ],
-)
-def test_bad_models_are_refused(change, match):
-    good = {"body": "suv", "segment": "JC", "size": (4.5, 1.85, 1.65), "paint": (9, 9, 9), "seed": 1}
-    VehicleModel(**good).footprint()
-    with pytest.raises(SensorError, match=match):
-        VehicleModel(**{**good, **change})
