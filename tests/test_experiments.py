@@ -95,13 +95,10 @@ def test_options_build_the_same_specification_as_a_file(tmp_path, sweep):
     assert Comparison.read(out / SPEC_FILE) == Comparison.read(sweep)
 
 
-def test_a_scenario_may_be_called_like_a_blind_one_but_no_two_alike():
-    plain, named = ({"name": name, "lot": "mini"} for name in ("x", "x-blind"))
+def test_a_scenario_may_be_called_like_a_blind_one():
+    named = {"name": "x-blind", "lot": "mini"}
     spec = Comparison.parse({"agents": ["belief"], "scenarios": [named], "episodes": 2}, "test")
     assert [case.scenario.name for case, _ in spec.cases] == ["x-blind"]
-    both = {"agents": ["mdp"], "scenarios": [plain, named], "grid": {"blind": True}, "episodes": 2}
-    with pytest.raises(InputError, match="two scenarios are called 'x-blind'"):
-        Comparison.parse(both, "test").check()
 
 
 def test_agents_with_options_are_read_from_words_and_tables():

@@ -54,6 +54,7 @@ from parkenv.world.lot import Lane, ParkingLot, Turn
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.fit import fit_constant_rates
 from parkenv.world.occupancy.process import Arrival
+from parkenv.world.tariff import Price, Tariff
 from sim_sensors import SensorError, SlotLot
 from sim_sensors.camera.image_sensor import ImageSensor
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
@@ -331,6 +332,8 @@ TAKERS = {
     "day error": DayError,
     "fuller": lambda arrival, level: constant_process(2, arrival, 1e-4).at_mean_occupancy(level, 0.0),
     "of demand": lambda slots, *stay_s: OccupancyProcess.from_demand(slots, np.zeros(168), *stay_s),
+    "price": Price.parse,
+    "tariff": Tariff,
     "look": lambda begin, time: (
         constant_process(2, 1e-4, 1e-4).world(KEY, Arrival(begin)).occupied([0], time)
     ),

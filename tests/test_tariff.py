@@ -163,8 +163,6 @@ def test_prices_are_added_to_those_of_paid_zones_and_set_by_hours():
     assert zone.price.raised(1.0).amount(begin, 7200.0).tolist() == [2.0, 7.0, 0.0]
     with pytest.raises(InputError, match="hourly"):
         Price(1.0, hourly=zone.price.hourly)
-    with pytest.raises(InputError, match="price"):
-        Tariff({"near": "cheap"})
 
 
 def test_a_scenario_changes_the_rules_of_zones():
