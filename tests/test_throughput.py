@@ -104,7 +104,7 @@ PEERS = ("examples.peers.pomdp_py_agents:POUCT", "examples.peers.pomdp_py_agents
 PAPERS = ("lmu:ReplannedMDP", "mit:StopsAhead", "mit:Impatient", "mit:Patient")
 CLEANRL, MODEL = "examples.peers.cleanrl:PPO", "docs/leaderboard/models/cleanrl.safetensors"
 METHODS = {f"examples.peers.{name}": {} for name in PAPERS} | {CLEANRL: {"file": MODEL}}
-METHODS |= {name: {"simulations": 30} for name in PEERS}
+METHODS |= {name: {"simulations": 30} for name in (*PEERS, "examples.rollout_agent:Rollout")}
 
 
 @pytest.fixture

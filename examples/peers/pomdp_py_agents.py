@@ -20,12 +20,12 @@ from typing import Any, ClassVar
 import numpy as np
 import pomdp_py
 
+from examples.rollout_agent import ModelAgent, ModelSearch
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.engine.model import Belief, Model, Observation, Simulations
 from parkenv.errors import require_number, require_one_of, require_whole
 from parkenv.world.scenario import SearchProblem
 from planners.heuristics.policies import POLICIES
-from planners.rollout import ModelAgent, ModelSearch
 
 DEPTH = 60  # actions of the tree and its rollouts, of which the last one drives to the end of the search
 N_PARTICLES = 200  # of POMCP's belief

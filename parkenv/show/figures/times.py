@@ -50,7 +50,6 @@ AGENT_COLORS = {
     "belief": "#cc79a7",
     "belief-rivals": "#661100",
     "network": "#44aa99",
-    "rollout": "#4b5d16",
     "dqn": "#999933",
     "ppo": "#332288",
     "maskable-ppo": "#aa4499",

@@ -288,7 +288,7 @@ class Comparison(CaseStudy):
         require(
             not self.grid.budget_ms or self.budgeted_agents != list(self.agents),
             f"{BUDGET} is {', '.join(f'{ms:g}' for ms in self.grid.budget_ms)}, and no agent takes it: {labels}; add "
-            "one that does, such as rollout",
+            "one that does, such as belief",
         )
         if repeated := [name for name in names if names.count(name) > 1]:
             raise InputError(
