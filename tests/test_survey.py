@@ -194,5 +194,5 @@ def test_one_aisle_is_driven_there_and_back_and_a_trap_not():
     assert (visits == 1).all()
     lane, slot = Lane([[0.0, 0.0], [20.0, 0.0]], oneway=True), ([[10.0, -5.5]], [-np.pi / 2], [5.0], [2.5])
     lot = ParkingLot("trap", ("a",), *slot, [Mouth.REAR], (lane,), [[0.0, 0.0]], [[5.0, 5.0]])
-    with pytest.raises(InputError, match="no drive leads from entry 0 past every slot and back"):
+    with pytest.raises(InputError, match="no drive leads from its first entry past every slot and back"):
         survey_route(lot)

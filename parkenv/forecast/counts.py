@@ -44,6 +44,7 @@ from parkenv.forecast.count_table import DAY_S, FINE, HOURS, Capacity, Readings,
 _TOLERANCE = 0.05  # of the capacity
 _SURPRISE = math.log(1e9)
 _WINDOW = 28  # days
+_IDLE = 0.02  # of the places, smallest change of occupancy of a car park in use
 _REPEATS_PRIOR = (2.0, 4.0)  # repeats of readings, and pairs, assumed before any is seen
 
 
@@ -113,13 +114,13 @@ class Counts:
     def total_faults(self) -> dict[str, int]:
         return {name: sum(faults[name] for faults in self.faults) for name in self.faults[0]}
 
-    def idle(self, most: float = 0.02) -> dict[str, str]:
+    def idle(self) -> dict[str, str]:
         idle = {}
         for name, y in zip(self.car_parks, self.occupied, strict=True):
             y = y[np.isfinite(y)]
             if not y.size:
                 idle[name] = "no usable readings"
-            elif np.quantile(y, 0.98) - np.quantile(y, 0.02) < most:
+            elif np.quantile(y, 0.98) - np.quantile(y, 0.02) < _IDLE:
                 idle[name] = f"dead: always {np.median(y):.0%} full"
             elif np.quantile(y, 0.999) < 0.25:
                 idle[name] = f"never filling: at most {y.max():.0%} full"

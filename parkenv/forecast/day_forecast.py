@@ -43,9 +43,9 @@ def logits(occupied: FloatArray, capacity: FloatArray) -> FloatArray:
 
 
 @cache
-def quantiles_of_t(n: int = 32) -> FloatArray:
-    """Return n equally likely values (n,) of the t distribution, scaled to variance 1."""
-    values = t.ppf((np.arange(n) + 0.5) / n, FREEDOM)
+def quantiles_of_t() -> FloatArray:
+    """Return 32 equally likely values (32,) of the t distribution, scaled to variance 1."""
+    values = t.ppf((np.arange(32) + 0.5) / 32, FREEDOM)
     return np.asarray(values / np.sqrt(np.mean(values**2)))
 
 

@@ -22,6 +22,8 @@ BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)  # bands of fullness
 Band = dict[str, float | int | None]  # A band of fullness: from, to, days, coverage_90
 
 _WEEK = 7  # days
+_BINS = 20  # of the forecast, whose reliability is shown
+_REPETITIONS = 1_000  # of a bootstrap
 
 
 def log_losses(forecast: DayForecast, occupied: FloatArray, capacity: FloatArray) -> FloatArray:
@@ -118,17 +120,17 @@ class Scores:
             rows.append({"from": low, "to": high, "days": int(inside.sum()), "coverage_90": share})
         return rows
 
-    def reliability(self, bins: int = 20) -> FloatArray:
+    def reliability(self) -> FloatArray:
         """Return mean forecast, mean of what was observed, and weight (3, k) of equally wide bins of the forecast.
 
         Empty bins are left out.
         """
         seen = self.weight > 0
         p, weight = self.occupancy[seen], self.weight[seen]
-        cell = np.minimum((p * bins).astype(int), bins - 1)
-        n = np.bincount(cell, weight, bins)
+        cell = np.minimum((p * _BINS).astype(int), _BINS - 1)
+        n = np.bincount(cell, weight, _BINS)
         used = n > 0
-        sums = (np.bincount(cell, weight * values, bins) for values in (p, self.observed[seen]))
+        sums = (np.bincount(cell, weight * values, _BINS) for values in (p, self.observed[seen]))
         return np.stack([*(total[used] / n[used] for total in sums), n[used]])
 
     def means(self) -> dict[str, float]:
@@ -168,16 +170,14 @@ class Estimate(NamedTuple):
     high: float
 
 
-def ratio_of_sums(
-    total: FloatArray, n: FloatArray, rng: np.random.Generator, repetitions: int = 1000
-) -> Estimate:
+def ratio_of_sums(total: FloatArray, n: FloatArray, rng: np.random.Generator) -> Estimate:
     """Return sum(total) / sum(n), with its interval by a bootstrap over rows, such as car parks, and columns, as weeks.
 
     >>> ratio_of_sums(np.array([[1.0, 2.0]]), np.array([[2.0, 4.0]]), np.random.default_rng(0))
     Estimate(value=0.5, low=0.5, high=0.5)
     """
     rows, columns = (
-        rng.multinomial(size, np.full(size, 1.0 / size), repetitions).astype(float) for size in total.shape
+        rng.multinomial(size, np.full(size, 1.0 / size), _REPETITIONS).astype(float) for size in total.shape
     )
     drawn_total, drawn_n = (
         np.einsum("kr,rc,kc->k", rows, values, columns, optimize=True) for values in (total, n)

@@ -32,8 +32,8 @@ class _Pass(NamedTuple):
     against: bool = False
 
 
-def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -> SurveyRoute:
-    """Drive from an entry past every slot, with the slot on the right, and back.
+def survey_route(lot: ParkingLot, *, both_sides: bool = False) -> SurveyRoute:
+    """Drive from the first entry past every slot, with the slot on the right, and back.
 
     Each side of a two-way lane is driven in its own direction. Slots on the left of a one-way lane would need a camera
     on the left; with a camera on the right, that lane is driven again against its direction, as in real surveys at
@@ -47,7 +47,7 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
     needed = list({p.stops[1:]: p for p in reversed(passes) if len(p.stops) > 2}.values())[::-1]
     if not both_sides:
         needed += [_Pass(p.stops[::-1], p.length, True) for p in needed if _left_slots(lot, p)]
-    start = int(lot.entry_vertices[entry])
+    start = int(lot.entry_vertices[0])
     ways = nx.DiGraph()
     for p in passes:
         a, b = p.stops[0], p.stops[-1]
@@ -72,7 +72,7 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
         _balance(drive, ways)
     except nx.NetworkXException as error:
         raise InputError(
-            f"lot {lot.name!r}: no drive leads from entry {entry} past every slot and back"
+            f"lot {lot.name!r}: no drive leads from its first entry past every slot and back"
         ) from error
     stops = [start]
     for a, b, key in nx.eulerian_circuit(drive, start, keys=True):
