@@ -1,6 +1,5 @@
 """`parkenv compare` and related commands: results, resuming, errors."""
 
-
 import numpy as np
 import pytest
 from command_line import ran, refused, rows_in, summary_of
