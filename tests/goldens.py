@@ -82,7 +82,6 @@ CASES: dict[str, tuple[str, ...]] = {
         "--picture a.png",
         "lot import {data}/osm_nl/zuid-holland_0101_285.geojson --entry auto --goal auto --out b.geojson",
         "lot convert {data}/dlp/parking_map.yml --out c.geojson",
-        "lot census a.geojson --out out",
         "lot show campus --out campus.png",
     ),
     "towns": (

@@ -1,7 +1,6 @@
 """Lots from outlines of parking spaces alone, and the survey of lots."""
 
 import copy
-import csv
 import json
 import re
 import sys
@@ -9,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 import shapely
-from command_line import parkenv, ran, refused, summary_of
+from command_line import ran, refused, summary_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lot_checks import refusal
@@ -24,7 +23,7 @@ from parkenv.lots.draft import ImportOptions, Provenance, read_provenance
 from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.spaces import spaces_from_outlines
 from parkenv.show.scene import PALETTE
-from parkenv.studies.lots import COLUMNS, check_drivability, count_lot, lot_columns, lot_files
+from parkenv.studies.lots import check_drivability, lot_columns
 from parkenv.world.lot import Lane, ParkingLot
 
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)
@@ -393,33 +392,3 @@ def test_the_drive_is_that_to_the_farthest_slot():
     assert columns_of(grid_lot(2, 30))["drive_s"] == pytest.approx(79.75 * 0.36, abs=0.06)
     sizes = [columns_of(grid_lot(2, n))["size"] for n in (39, 40, 99, 100)]
     assert sizes == ["small", "medium", "medium", "large"]
-
-
-def test_a_census_is_a_table_and_pictures(lots, tmp_path):
-    out = tmp_path / "census"
-    done = ran("lot census --out", out, lots)
-    assert "3 lots, 140 slots: 3 clean" in done.stdout
-    assert sorted(path.name for path in out.iterdir()) == [
-        "census.csv", "census.png", "contact-sheet-1.png", "summary.json",
-    ]  # fmt: skip
-    rows = summary_of(out)["rows"]
-    assert [row["slots"] for row in rows] == [120, 10, 10], "the largest first"
-    with (out / "census.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert tuple(table[0]) == COLUMNS
-    assert [row["file"] for row in table] == [row["file"] for row in rows]
-    assert float(table[0]["drive_s"]) == rows[0]["drive_s"]
-
-
-def test_what_is_no_lot_is_named_and_the_others_are_counted(lots, tmp_path):
-    (lots / "broken.geojson").write_text('{"type": "FeatureCollection", "features": [')
-    done = parkenv("lot", "census", lots, "--out", tmp_path / "census")
-    assert (done.returncode, "3 clean, 1 invalid" in done.stdout) == (2, True)
-    rows = summary_of(tmp_path / "census")["rows"]
-    assert [row["result"] for row in rows] == ["clean"] * 3 + ["invalid"]
-    assert "not JSON" in rows[-1]["reason"]
-    assert count_lot(lots / "broken.geojson")[1] is None
-    for place, message in ((tmp_path / "none", "no such file or folder"), (tmp_path, "holds no lot")):
-        with pytest.raises(InputError, match=message):
-            lot_files([place])
-        assert message in refused("lot", "census", place)

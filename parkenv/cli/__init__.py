@@ -42,13 +42,12 @@ COMMANDS = {
     "benchmark show": Entry("Show the tasks and settings of the suite.", "benchmark:Show"),
     "park": Entry("Evaluate agents that drive the car into a slot.", "park", AGENTS),
     "calibrate": Entry("Measure the costs of searches on whole driven trips.", "calibrate", AGENTS),
-    "lot": Entry("Show, check, import, count and convert lots.", heading=PLACES),
+    "lot": Entry("Show, check, import and convert lots.", heading=PLACES),
     "lot show": Entry("Draw a lot and summarise it.", "lot:Show"),
     "lot check": Entry(
         "List all errors and warnings of a lot file, by feature number (from 0).", "lot:Check"
     ),
     "lot import": Entry("Import a real place; report what was found, guessed and left out.", "lot:Import"),
-    "lot census": Entry("Describe lots: size, kinds of slots, distances, error probability.", "lot:Census"),
     "lot convert": Entry("Write a lot as native GeoJSON.", "lot:Convert"),
     "occupancy": Entry("Fit models to recorded occupancy, and score forecasts.", heading=PLACES),
     "occupancy fit": Entry("Fit a model to recorded occupancy by maximum likelihood.", "occupancy:Fit"),

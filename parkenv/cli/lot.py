@@ -397,50 +397,6 @@ class Import(Command):
         self.say(f"{plural(len(rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}")
 
 
-class Census(Command):
-    """A slot is perpendicular, oblique or kerbside by the angle between its lane and the parked car.
-
-    The kind of a lot is that of at least nine in ten of its slots, else mixed. A lot is small below 80 slots, large
-    from 200. The drive time is that from an entry to the slot farthest from it, at 10 km/h. The error probability is
-    that of `parkenv lot check`.
-
-    The exit code is 2 if a file holds no lot; the others are counted nevertheless.
-    """
-
-    soft_wrap: ClassVar = True
-    examples = """
-        parkenv lot import town.geojson --split --out lots
-        parkenv lot census lots
-        parkenv lot census campus.geojson lots --out results/all
-        """
-
-    places: Several[Path] = option(
-        ..., "Lots (.geojson, .yml), and folders of lots (.geojson).", takes="FILE|DIR", argument=True
-    )
-    out: Path = option(
-        Path("results/census"),
-        "Folder for census.csv, summary.json, census.png and contact sheets.",
-        short="-o",
-    )
-
-    def run(self) -> None:
-        from parkenv.studies.lots import take_census
-
-        with stages(self.console, "lots") as progress:
-            rows = take_census(self.places, self.out, progress=progress)
-        save_summary(self.out, None, rows)
-        print_rows(make_console(), "Lots", rows, [column.key for column in _LOT_COLUMNS], _LOT_COLUMNS)
-        results, slots = Counter(row["result"] for row in rows), sum(row.get("slots", 0) for row in rows)
-        listed = ", ".join(
-            f"{results[name]} {name}" for name in ("clean", "warnings", "invalid") if results[name]
-        )
-        self.say(
-            f"{plural(len(rows), 'lot')}, {slots:,} slots: {listed}. Table and pictures are in {self.out}"
-        )
-        if results["invalid"]:
-            raise Exit(2)
-
-
 class Convert(Command):
     """The file can be edited in a GIS."""
 

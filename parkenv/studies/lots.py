@@ -1,4 +1,4 @@
-"""Lots under examination: clear lanes and closed one-way loops, a census, and imports of all car parks of a town."""
+"""Lots under examination: clear lanes and closed one-way loops, and imports of all car parks of a town."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,22 +9,18 @@ import shapely
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, require
-from parkenv.files.atomic_write import make_folder
-from parkenv.files.csv_tables import write_csv
-from parkenv.lots import read_lot, write_lot
+from parkenv.lots import write_lot
 from parkenv.lots.draft import (
     ImportOptions,
     Provenance,
     QualityIssue,
     combined_error_probability,
-    read_provenance,
 )
 from parkenv.lots.formats.contents import LotProblem
 from parkenv.lots.generators import nearest_on_lanes
 from parkenv.lots.lot_files import dead_ends
 from parkenv.lots.osm.draft import import_car_parks
-from parkenv.show.figures.lots import save_census, save_contact_sheets
+from parkenv.show.figures.lots import save_contact_sheets
 from parkenv.show.tables import plural
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
@@ -109,49 +105,6 @@ KERBSIDE_BELOW, OBLIQUE_BELOW = 15, 75
 # Names of sizes, each with the number of slots that it stays below.
 SIZES = (("small", 80), ("medium", 200), ("large", np.inf))
 V_DRIVE = 10.0 * KMH  # m/s, of the drive time
-# Columns of a census.
-COLUMNS = (
-    "lot", "file", "slots", "size", "kind", *KINDS, "extent_x_m", "extent_y_m", "lanes", "one_way_lanes", "entries",
-    "goals", "drive_s", "error_probability", "result", "reason",
-)  # fmt: skip
-
-
-def lot_files(places: Sequence[Path]) -> list[Path]:
-    files: list[Path] = []
-    for place in places:
-        require(
-            place.exists(),
-            f"{place}: no such file or folder, want a lot (.geojson, .yml) or a folder of lots",
-        )
-        lots = (
-            sorted(path for path in place.iterdir() if path.suffix == ".geojson")
-            if place.is_dir()
-            else [place]
-        )
-        require(lots, f"{place}: holds no lot (.geojson)")
-        files += lots
-    return files
-
-
-def take_census(places: Sequence[Path], folder: Path, *, progress: Progress = lambda *_: None) -> list[Row]:
-    """Count lots; write census.csv, census.png and contact sheets; return a row of each, the largest first.
-
-    Rows of files that hold no lot say why.
-    """
-    files = lot_files(places)
-    make_folder(folder)
-    done = counted(progress, "Checking", len(files))
-    counts = []
-    for file in files:
-        counts.append(count_lot(file))
-        done()
-    counts.sort(key=lambda count: -count[0].get("slots", 0))
-    rows = [row for row, _ in counts]
-    write_csv(folder / "census.csv", COLUMNS, rows)
-    if lots := [(row, lot) for row, lot in counts if lot is not None]:
-        save_census([row for row, _ in lots], folder / "census.png")
-        _draw(lots, folder)
-    return rows
 
 
 def import_town_lots(
@@ -159,7 +112,7 @@ def import_town_lots(
 ) -> list[Row]:
     """Write a lot of every car park of a town, of at least `least` spaces, and contact sheets into a folder.
 
-    Returns a row of each car park: lot, spaces, result, reason, and columns of a census.
+    Returns a row of each car park: lot, spaces, result, reason, and `lot_columns`.
     """
     rows: list[Row] = []
     lots = []
@@ -193,17 +146,6 @@ def _draw(lots: Sequence[tuple[Row, ParkingLot]], folder: Path) -> None:
     ]
     drawn = [(f"{lot.name}\n{count}", lot) for count, (_, lot) in zip(counts, lots, strict=True)]
     save_contact_sheets(drawn, folder)
-
-
-def count_lot(path: Path) -> tuple[Row, ParkingLot | None]:
-    try:
-        lot = read_lot(path)
-        origin = read_provenance(path) if path.suffix == ".geojson" else None
-    except InputError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-        return {"lot": path.stem, "file": str(path), "result": "invalid", "reason": reason}, None
-    drivability = check_drivability(lot, origin.issues if origin is not None else ())
-    return {"lot": lot.name, "file": str(path), **lot_columns(lot, drivability)}, lot
 
 
 def lot_columns(lot: ParkingLot, drivability: Drivability) -> Row:

@@ -1,4 +1,4 @@
-"""Pictures to check lots by: imports, discovered streets, contact sheets, and the chart of a census."""
+"""Pictures to check lots by: imports, discovered streets and contact sheets."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from parkenv.lots.generators import nearest_on_lanes
 from parkenv.lots.town.draft import TownDraft
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.street_slots import CAR, StreetSlots
-from parkenv.show.figures.charts import Panel, key_line
+from parkenv.show.figures.charts import key_line
 from parkenv.show.figures.lot import BELIEF_MAP, ENTRY, GOAL, GROUND, INK, draw_lot
 from parkenv.show.figures.picture_files import INK as DARK
 from parkenv.show.figures.picture_files import STYLE, picture, save_picture
@@ -58,8 +58,6 @@ WIDTH, HEIGHT, KEY = 2.8, 3.2, 0.4
 SCALES = (5, 10, 20, 50, 100, 200, 500)  # lengths of the scale bar, m
 LONGEST_NAME = 28
 LARGEST = 60  # number of lots in one sheet
-KIND_COLORS = {"perpendicular": "#0072b2", "oblique": "#e69f00", "kerbside": "#009e73", "mixed": "#8c8c8c"}
-_EDGES_AN_OCTAVE = 2
 
 
 def _schematic(
@@ -277,60 +275,6 @@ def _draw_small(ax: Axes, lot: ParkingLot) -> None:
     bar_y = low[1] - 0.08 * extent
     ax.plot([low[0], low[0] + length], [bar_y, bar_y], color=INK, linewidth=1.5, solid_capstyle="butt")
     ax.text(low[0] + length, bar_y, f" {length} m", fontsize=8, color=INK, va="center")
-
-
-def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
-    lots, slots = plural(len(rows), "lot"), np.array([row["slots"] for row in rows], float)
-    kinds = list(KIND_COLORS)[:-1]
-    present = [kind for kind in KIND_COLORS if kind in {row["kind"] for row in rows}]
-    stacked: dict[str, Any] = {"stacked": True, "edgecolor": "white", "linewidth": 0.4}
-    stacked["color"] = [KIND_COLORS[kind] for kind in present]
-
-    def by_kind(name: str) -> list[np.ndarray]:
-        return [np.array([row[name] for row in rows if row["kind"] == kind], float) for kind in present]
-
-    low, high = np.floor(np.log2(slots.min())), np.ceil(np.log2(slots.max() + 1))
-    edges = 2.0 ** np.arange(low, high + 1e-9, 1 / _EDGES_AN_OCTAVE)
-    ticks = edges[:: _EDGES_AN_OCTAVE * (1 if high - low < 6 else 2)]
-    total = [sum(row[name] for row in rows) for name in kinds]
-
-    def by_octaves(ax: Axes) -> None:
-        ax.set_xscale("log", base=2)
-        ax.set_xticks(ticks, [f"{tick:.0f}" for tick in ticks])
-        ax.minorticks_off()
-
-    def draw_kinds(ax: Axes) -> None:
-        bars = ax.barh(kinds, total, color=[KIND_COLORS[name] for name in kinds])
-        ax.bar_label(bars, [f"{count:,}" for count in total], padding=2)
-        ax.spines["bottom"].set_visible(False)
-        ax.invert_yaxis()
-
-    def draw_drives(ax: Axes) -> None:
-        for name, x, y in zip(present, by_kind("slots"), by_kind("drive_s"), strict=True):
-            ax.plot(x, y, "o", color=KIND_COLORS[name], markersize=4, alpha=0.75)
-
-    wrong = np.arange(0.0, max(row["error_probability"] for row in rows) + 0.1, 0.1)
-    clean = sum(row["result"] == "clean" for row in rows)
-    drives = {"xlabel": "slots", "ylabel": "s, at 10 km/h", "ylim": (0, None)}
-    panels = (
-        Panel(
-            [lambda ax: ax.hist(by_kind("slots"), edges.tolist(), **stacked), by_octaves],
-            f"{lots} by size", {"xlabel": "slots", "ylabel": "lots"}, "y",
-        ),
-        Panel([draw_kinds], f"{sum(total):,} slots by kind", {"xticks": [], "xlim": (0, 1.35 * max(total))}, ""),
-        Panel([draw_drives, by_octaves], "Drive to the farthest slot", drives, "y"),
-        Panel(
-            [lambda ax: ax.hist(by_kind("error_probability"), wrong.tolist(), **stacked)], f"{clean} without a warning",
-            {"xlabel": "error probability", "ylabel": "lots"}, "y",
-        ),
-    )  # fmt: skip
-    caption = f"{lots}: sizes, kinds of slots, drive times at 10 km/h, error probabilities."
-    with picture(path, (10.5, 3.4), caption) as figure:
-        grid = figure.subplots(1, 4, width_ratios=(1.2, 0.9, 1.3, 0.9))
-        for ax, panel in zip(grid, panels, strict=True):
-            panel.draw(ax)
-        key = [Patch(color=KIND_COLORS[name], label=name) for name in present]
-        figure.legend(handles=key, title="lots that are", loc="outside lower center", ncols=len(key))
 
 
 KERB, TRACK, UNSEEN = "#7030aa", "#0072b2", "#b9bec4"
