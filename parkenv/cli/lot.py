@@ -109,11 +109,11 @@ class Check(Command):
 
     def run(self) -> None:
         from parkenv.lots import check_lot, read_lot
-        from parkenv.lots.lot_files import WHOLE, lot_format
+        from parkenv.lots.lot_files import lot_format
         from parkenv.studies.lots import check_drivability
 
         problems, form, drivability = check_lot(self.place), lot_format(self.place), None
-        if form in WHOLE and not any(p.severity == "error" for p in problems):
+        if form != "osm" and not any(p.severity == "error" for p in problems):
             origin = _provenance(self.place)
             with warnings.catch_warnings(action="ignore"):  # listed already
                 lot = read_lot(self.place)

@@ -30,15 +30,12 @@ FORMATS = {
     **dict.fromkeys((".yml", ".yaml"), "dragon-lake"),
     **dict.fromkeys((".osm", ".xml", ".pbf"), "osm"),
 }
-WHOLE = (
-    "native",
-    "dragon-lake",
-)  # formats that define a whole lot; of others, `import_lot` derives one by rules
 
 
 def lot_format(path: Path) -> str | None:
     """Return a file's format by its suffix and, for JSON, its content; None for an unknown suffix. Does not raise.
 
+    `native` and `dragon-lake` are whole lots; of `osm`, `import_lot` derives one by rules.
     A JSON file that cannot be read counts as native: its reader then reports the error.
     """
     suffix = unpacked_path(path).suffix.lower()
@@ -99,7 +96,7 @@ def _read_whole(path: Path) -> tuple[ParkingLot, str]:
             pass
     errors = [*contents.errors, *graph_errors(contents)]
     first = str(errors[0]).removeprefix("error: ")
-    if file_format is not None and file_format not in WHOLE:
+    if file_format == "osm":
         raise InputError(f"{path}: {first}; `parkenv lot import {path}` makes a lot of it")
     more = f" (and {len(errors) - 1} more; `parkenv lot check {path}` lists all)" if len(errors) > 1 else ""
     raise InputError(f"{path}: {first}{more}")
@@ -251,7 +248,7 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     file_format = lot_format(path)
     try:
         if file_format not in (None, "native"):
-            return _import_problems(path, file_format)
+            return _import_problems(path)
     except InputError as error:
         return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
     contents = read_contents(path)
@@ -263,10 +260,8 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     return problems
 
 
-def _import_problems(path: Path, file_format: str | None) -> list[LotProblem]:
+def _import_problems(path: Path) -> list[LotProblem]:
     draft = import_lot(path)
-    if file_format in WHOLE:
-        return []
     problems = [LotProblem("error", None, text) for text in draft.missing]
     warnings = [LotProblem("warning", None, f"left out: {left}") for left in draft.left_out]
     if not problems:

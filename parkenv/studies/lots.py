@@ -17,7 +17,7 @@ from parkenv.lots.draft import (
     combined_error_probability,
 )
 from parkenv.lots.formats.contents import LotProblem
-from parkenv.lots.generators import nearest_on_lanes
+from parkenv.lots.generators import Slots, nearest_on_lanes
 from parkenv.lots.lot_files import dead_ends
 from parkenv.lots.osm.draft import import_car_parks
 from parkenv.show.figures.lots import save_contact_sheets
@@ -25,7 +25,7 @@ from parkenv.show.tables import plural
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
 from parkenv.world.drive_graph import linestrings
-from parkenv.world.lot import Mouth, ParkingLot, corner_points, is_building, mouth_heading
+from parkenv.world.lot import Mouth, ParkingLot, is_building
 from parkenv.world.scenario import KMH
 
 CAR_ROOM = 1.0  # half the width, m, that a car needs on a lane: 1.8 m and the mirrors
@@ -62,14 +62,11 @@ def _open_loops(lot: ParkingLot) -> list[str]:
 
 
 def _blocked_lanes(lot: ParkingLot) -> list[str]:
-    boxes = shapely.polygons(
-        corner_points(lot.slot_xy, lot.slot_yaw, lot.slot_length - 0.2, lot.slot_width - 0.2)
-    )
     walls = [
         shapely.make_valid(shapely.Polygon(wall)) if is_building(wall) else shapely.LineString(wall)
         for wall in lot.walls
     ]
-    things = np.concatenate([np.atleast_1d(np.asarray(boxes)), np.array(walls, dtype=object)])
+    things = np.concatenate([Slots.of_lot(lot).boxes(shrink=0.2), np.array(walls, dtype=object)])
     lanes = linestrings([lane.points for lane in lot.lanes])
     lane, thing = shapely.STRtree(things).query(lanes, predicate="dwithin", distance=CAR_ROOM)
     texts = []
@@ -83,9 +80,9 @@ def _blocked_lanes(lot: ParkingLot) -> list[str]:
 
 def _slants(lot: ParkingLot) -> FloatArray:
     """Return the angle between the lane and the parked car in each slot, (n_slots,) degrees, in steps of five."""
-    mouth, heading = lot.mouth_xy(), mouth_heading(lot.slot_yaw, lot.slot_mouth)
+    slots = Slots.of_lot(lot)
+    mouth, outward = slots.mouths(), slots.outward()
     nearest, tangent, _ = nearest_on_lanes(lot.lanes, mouth)
-    outward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     left = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     across = left * np.where((left * outward).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
     # A lane may end before a slot, or bend around it.

@@ -55,7 +55,7 @@ def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> S
     width = np.minimum(across, area / length)
     spaces = Spaces(tuple(ids), corners.mean(axis=1), axis, length, width)
     _refuse_drawn_twice(ids, outlines, area)
-    return without_overlaps(spaces)
+    return _without_overlaps(spaces)
 
 
 def validate_areas(ids: Sequence[str], area: FloatArray) -> None:
@@ -100,7 +100,7 @@ def _refuse_drawn_twice(ids: Sequence[str], outlines: NDArray[np.object_], area:
         )
 
 
-def without_overlaps(spaces: Spaces) -> Spaces:
+def _without_overlaps(spaces: Spaces) -> Spaces:
     length, width = spaces.length.copy(), spaces.width.copy()
     for _ in range(6):
         boxes = replace(spaces, length=length, width=width).boxes(shrink=0.08)
