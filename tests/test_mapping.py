@@ -34,19 +34,19 @@ LASER, MOUNT = LaserScanner(), Mount(z=0.5)
 
 
 def test_looks_free_and_fill_cells_as_the_filter_says():
-    grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.25)
-    grid.update((0.1, 0.1), 0.0, math.radians(30.0), np.array([[0.0, 5.0]]), 10.0, car=4.0)
+    grid = OccupancyGrid((0.0, -5.0), (14.0, 5.0), 0.25)
+    grid.update((0.1, 0.1), 0.0, math.radians(30.0), np.array([[0.0, 5.0]]))
     row, columns = int(5.1 / 0.25), [int(x / 0.25) for x in (3.0, 7.0, 9.6)]  # before, on and behind the car
     assert grid.probability[row, columns] == pytest.approx([P_FREE, P_OCCUPIED, 0.5], abs=1e-6)
     assert not grid.seen[row, columns[-1]]
     assert grid.probability[0, -1] == 0.5
     grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.25)
     for _ in range(3):
-        grid.update((0.1, 0.1), 0.0, 0.5, np.empty((0, 2)), 10.0)
+        grid.update((0.1, 0.1), 0.0, 0.5, np.empty((0, 2)))
     odds = (P_FREE / (1 - P_FREE)) ** 3
     assert grid.probability[20, 12] == pytest.approx(odds / (1 + odds), abs=1e-6)
     for _ in range(200):
-        grid.update((0.1, 0.1), 0.0, 0.5, np.empty((0, 2)), 10.0)
+        grid.update((0.1, 0.1), 0.0, 0.5, np.empty((0, 2)))
     assert grid.log_odds.min() == pytest.approx(-12.0)
 
 

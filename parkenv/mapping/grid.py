@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError, require_number
+from parkenv.perception.box_fit import CAR_LENGTH, CAR_WIDTH
 from parkenv.perception.slot_filter import P_FREE, P_OCCUPIED
 
 MOST_LOG_ODDS = 12.0  # bound of the log-odds, so that later observations can still change the estimate
+REACH = 12.0  # m, d_max, distance of the frontier along the optical axis
 _UNOBSERVED, _FREE, _OCCUPIED = 0, 1, 2
 
 
@@ -70,10 +72,6 @@ class OccupancyGrid:
         yaw: float,
         half_angle: float,
         cars: FloatArray,
-        reach: float = 12.0,
-        *,
-        car: float = 4.4,
-        half_width: float = 0.9,
     ) -> None:
         """Update the grid from the cars in one image (eq. 3.9).
 
@@ -87,24 +85,15 @@ class OccupancyGrid:
             yaw: rad, direction of the optical axis, world frame.
             half_angle: rad, half the horizontal field of view; below π/2.
             cars: (n, 2) bearing, rad counter-clockwise from `yaw`, and distance, m, of each detected car.
-            reach: m, d_max, distance of the frontier along the optical axis.
-            car: m, s_car, depth of the occupied cells behind the detected point.
-            half_width: m, half the width of a car across the rays.
 
         Raises:
             InputError: a number outside its range.
         """
         require_number("half_angle", half_angle, above=0.0, below=math.pi / 2)
-        require_number("reach", reach, above=0.0)
         polar = np.asarray(cars, dtype=np.float64).reshape(-1, 2)
         x, y = self._cells(*camera)
-        self._add(
-            _mark_view(
-                self._marks, x, y, yaw, half_angle,
-                np.ascontiguousarray(polar[:, 0]), polar[:, 1] / self.cell,
-                reach / self.cell, car / self.cell, half_width / self.cell,
-            )
-        )  # fmt: skip
+        bearing, distance = np.ascontiguousarray(polar[:, 0]), polar[:, 1] / self.cell
+        self._add(_mark_view(self._marks, x, y, yaw, half_angle, bearing, distance, self.cell))
 
     def merge(self, other: OccupancyGrid) -> None:
         """Add the evidence of another grid of the same cells."""
@@ -162,15 +151,13 @@ def _mark_view(
     half_angle: float,
     bearing: FloatArray,
     distance: FloatArray,
-    reach: float,
-    car: float,
-    half_width: float,
+    cell: float,
 ) -> tuple[int, int, int, int]:
-    """Mark the observed cells, all lengths in cells; return the window of rows and columns that may be marked."""
-    side = reach / math.cos(half_angle)
+    """Mark the observed cells of a size, m; lengths are in cells. Return the rows and columns that may be marked."""
+    side = REACH / cell / math.cos(half_angle)
     left_x, left_y = x + side * math.cos(yaw + half_angle), y + side * math.sin(yaw + half_angle)
     right_x, right_y = x + side * math.cos(yaw - half_angle), y + side * math.sin(yaw - half_angle)
-    half_bearing = np.arctan2(half_width, distance)
+    half_bearing = np.arctan2(CAR_WIDTH / 2 / cell, distance)
     column, row = math.floor(left_x), math.floor(left_y)
     end_column, end_row = math.floor(right_x), math.floor(right_y)
     dx, dy = abs(end_column - column), -abs(end_row - row)
@@ -185,7 +172,7 @@ def _mark_view(
             off -= 2.0 * math.pi * math.floor(off / (2.0 * math.pi) + 0.5)
             if abs(off) <= half_bearing[k]:
                 nearest = min(nearest, distance[k])
-        _ray(marks, x, y, column, row, nearest, nearest + car)
+        _ray(marks, x, y, column, row, nearest, nearest + CAR_LENGTH / cell)
         if column == end_column and row == end_row:
             break
         twice = 2 * error

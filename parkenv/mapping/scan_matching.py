@@ -238,7 +238,7 @@ def _near_edges(edges: _Edges, pose: FloatArray) -> _Edges:
 
 
 def _to_edges(ends: FloatArray, pose: FloatArray, edges: _Edges) -> _Fit:
-    edge, residual = _matched_edges(ends, pose[0], pose[1], *edges)
+    edge, residual = _matched_edges(ends, pose[0], pose[1], edges)
     points = np.flatnonzero(edge >= 0)
     edge, residual = edge[points], residual[points]
     sd = edges.sd[edge]
@@ -249,21 +249,12 @@ def _to_edges(ends: FloatArray, pose: FloatArray, edges: _Edges) -> _Fit:
 
 
 @compiled
-def _matched_edges(
-    ends: FloatArray,
-    x: float,
-    y: float,
-    start: FloatArray,
-    along: FloatArray,
-    normal: FloatArray,
-    length: FloatArray,
-    sd: FloatArray,
-    two_sided: NDArray[np.bool_],
-) -> tuple[IntArray, FloatArray]:
+def _matched_edges(ends: FloatArray, x: float, y: float, edges: _Edges) -> tuple[IntArray, FloatArray]:
     """Return the edge that each point most probably is of, (n,), -1 for none, and how far beside it the point is, m."""
     matched = np.full(len(ends), -1, dtype=np.int64)
     residual = np.zeros(len(ends))
     best = np.full(len(ends), GATE)
+    start, along, normal, length, sd, two_sided = edges
     for e in range(len(sd)):
         side = (x - start[e, 0]) * normal[e, 0] + (y - start[e, 1]) * normal[e, 1]
         if side <= 0.0 and not two_sided[e]:
