@@ -207,21 +207,16 @@ def _lot_edges(lot: ParkingLot) -> _Edges:
     half = 0.5 * np.column_stack([length, np.minimum(USUAL_CAR[1], lot.slot_width)])
     ahead = np.column_stack([np.cos(lot.slot_yaw), np.sin(lot.slot_yaw)])
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-    starts, ends, sd = [], [], []
     # Counter-clockwise: rear, right side, front, left side have their outside on the right.
     corners = [
         lot.slot_xy + i * half[:, :1] * ahead + j * half[:, 1:] * left
         for i, j in ((-1, 1), (-1, -1), (1, -1), (1, 1), (-1, 1))
     ]
-    for (start, end), spread in zip(pairwise(corners), (END_SD, SIDE_SD, END_SD, SIDE_SD), strict=True):
-        starts.append(start)
-        ends.append(end)
-        sd.append(np.full(len(start), spread))
-    for wall in lot.walls:
-        starts.append(wall[:-1])
-        ends.append(wall[1:])
-        sd.append(np.full(len(wall) - 1, WALL_SD))
-    start, end, spreads = np.concatenate(starts), np.concatenate(ends), np.concatenate(sd)
+    lines = [*pairwise(corners), *((wall[:-1], wall[1:]) for wall in lot.walls)]
+    start, end = (np.concatenate([line[k] for line in lines]) for k in (0, 1))
+    spreads = np.repeat(
+        [END_SD, SIDE_SD, END_SD, SIDE_SD, *[WALL_SD] * len(lot.walls)], [len(line[0]) for line in lines]
+    )
     size = np.hypot(*(end - start).T)
     kept = size > 0.0
     start, along, size = start[kept], (end - start)[kept] / size[kept, None], size[kept]
