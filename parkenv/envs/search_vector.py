@@ -145,11 +145,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         if max_episode_steps is not None:
             require_whole("max_episode_steps", max_episode_steps, least=1, most=2**31 - 1)
         require_one_of("render_mode", render_mode, (None, "rgb_array"))
-        try:
-            mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            known = ", ".join(m.value for m in AutoresetMode)
-            raise InputError(f"autoreset_mode is {autoreset_mode!r}, want one of {known}") from None
+        mode = _mode_of(autoreset_mode)
         require_changes((type(self), ParkSearchVectorEnv), changes)
         require(k is None or observation == "local", f"k is {k!r}, want None unless observation is local")
         require_number("reward_scale", reward_scale, above=0.0)
@@ -170,13 +166,11 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._mode, self._copy = mode, copy
         self._begun = False
         self.render_mode = render_mode
-        self._states: list[SearchState] = []
         self._renderers: dict[str, SearchRenderer] = {}
         self._nobody = np.zeros(n, dtype=np.bool_)
         self._done = self._nobody
         self._find_arrays()
-        if render_mode:
-            self._states = [SearchState(self._searches, i) for i in range(n)]
+        self._states = [SearchState(self._searches, i) for i in range(n if render_mode else 0)]
 
     def _find_arrays(self) -> None:
         self._searches, self._seen = self.observer.searches, self.observer.seen
@@ -244,35 +238,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         Raises:
             InputError: an unknown option, or a number of seeds that differs from the number of environments.
         """
-        given = None
-        if isinstance(options, Sequence):
-            starts = [reset_options(own, START_OPTIONS) for own in options]
-            require(
-                len(starts) == self.num_envs,
-                f"options are {len(starts)}, want {self.num_envs}, or one for all",
-            )
-        else:
-            start = reset_options(options, (*START_OPTIONS, "reset_mask"))
-            given = start.pop("reset_mask", None)
-            starts = [start] * self.num_envs
-        which = np.ones(self.num_envs, dtype=np.bool_) if given is None else np.asarray(given)
-        require(
-            which.shape == (self.num_envs,) and which.dtype == np.bool_,
-            f"reset_mask has shape {which.shape} and type {which.dtype}, want ({self.num_envs},) bool",
-        )
+        starts, which = _starts_of(options, self.num_envs)
         require(self._begun or which.all(), "reset_mask leaves out environments that have no episode yet")
-        if seed is not None and not isinstance(seed, (Sequence, np.ndarray)):
-            require_whole("seed", seed)
-        if seed is None or isinstance(seed, (int, np.integer)):
+        seeds = _seeds_of(seed, self.num_envs)
+        if not isinstance(seed, Sequence | np.ndarray):
             super().reset(seed=None if seed is None else int(seed))
-        seeds = [seed] * self.num_envs if seed is None or isinstance(seed, (int, np.integer)) else list(seed)
-        require(
-            len(seeds) == self.num_envs,
-            f"seed holds {len(seeds)} numbers, want {self.num_envs}, one for each environment",
-        )
-        if isinstance(seed, (int, np.integer)):
-            seeds = [int(seed) + i for i in range(self.num_envs)]
-        elif not self._begun and None in seeds:
+        if not self._begun and None in seeds:
             # These never got a seed. If `np_random` was set by hand, its seed is unknown.
             _ = self.np_random
             known = self.np_random_seed
@@ -294,7 +265,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._arrive(which)
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
         self._done = self._done & ~which
-        return self._observations(), self._metrics(which.copy())
+        return self._observations(), self._info(which.copy())
 
     def close_extras(self, **kwargs: Any) -> None:
         del kwargs
@@ -319,17 +290,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ) -> tuple[dict[str, NDArray[Any]], FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         if not self._begun:
             raise gym.error.ResetNeeded("the environments have no episode yet: call reset() first")
-        actions = np.asarray(actions)
-        if actions.shape != (self.num_envs,) or actions.dtype.kind not in "iu":
-            raise InputError(
-                f"actions have shape {actions.shape} and type {actions.dtype}, want ({self.num_envs},) whole numbers"
-            )
-        actions = actions.astype(np.int64, copy=False)
-        wrong = first_wrong(actions)
-        if wrong >= 0:
-            raise InputError(
-                f"actions[{wrong}] is {actions[wrong]}, want a number from 0 to {PARK} ({', '.join(ACTIONS)})"
-            )
+        actions = _checked(actions, self.num_envs)
         fresh = self._nobody
         if self._mode is AutoresetMode.NEXT_STEP:
             fresh = self._done
@@ -342,7 +303,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._done = done = steps.terminated | steps.truncated
         info: dict[str, Any] = {}
         if done.any():
-            info = self._metrics(done.copy())
+            info = self._info(done.copy())
             if self._mode is AutoresetMode.SAME_STEP:
                 info = {"final_info": info, "_final_info": done.copy()}
                 info["final_obs"], info["_final_obs"] = self._final_observations(done), done.copy()
@@ -386,6 +347,11 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             for i in np.flatnonzero(which):
                 searches.complete_arrival(int(i))
 
+    def _info(self, done: BoolArray) -> dict[str, Any]:
+        info = _metrics(self.observer.address, done, self.reward_scale)
+        info["scenario_index"] = self.scenario_index
+        return info | dict.fromkeys(_WHICH, done)
+
     def _observations(self) -> Any:
         observations = self.observer.observations() if self._copy else dict(self._seen)
         return observations if self._flat is None else self._flat(observations)
@@ -396,16 +362,66 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             final[i] = (self._flat or dict)({name: a[i].copy() for name, a in self._seen.items()})
         return final
 
-    def _metrics(self, done: BoolArray) -> dict[str, Any]:
-        words = np.zeros((len(_OFFSETS), self.num_envs), np.int64)
-        copy_fields(self.observer.address, done, _OFFSETS, words)
-        # A type of fewer bytes stands at the beginning of its eight.
-        views = [words.view(dtype)[:, :: 8 // dtype.itemsize] for dtype in _TYPES]
-        metrics: dict[str, Any] = {name: views[dtype][i] for i, (name, dtype) in enumerate(_METRIC_TYPES)}
-        costs = words[len(METRICS) :].view(np.float64)
-        metrics |= zip(REWARD_TERMS, np.multiply(costs, -self.reward_scale, out=costs), strict=True)
-        metrics["scenario_index"] = self.scenario_index
-        return metrics | dict.fromkeys(_WHICH, done)
+
+def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        known = ", ".join(m.value for m in AutoresetMode)
+        raise InputError(f"autoreset_mode is {mode!r}, want one of {known}") from None
+
+
+def _starts_of(options: Any, n: int) -> tuple[list[dict[str, Any]], BoolArray]:
+    """Return where and when each of n searches begins, as options of `reset` say, and which of them do, (n,) bool."""
+    given = None
+    if isinstance(options, Sequence):
+        starts = [reset_options(own, START_OPTIONS) for own in options]
+        require(len(starts) == n, f"options are {len(starts)}, want {n}, or one for all")
+    else:
+        start = reset_options(options, (*START_OPTIONS, "reset_mask"))
+        given = start.pop("reset_mask", None)
+        starts = [start] * n
+    which = np.ones(n, dtype=np.bool_) if given is None else np.asarray(given)
+    require(
+        which.shape == (n,) and which.dtype == np.bool_,
+        f"reset_mask has shape {which.shape} and type {which.dtype}, want ({n},) bool",
+    )
+    return starts, which
+
+
+def _seeds_of(seed: int | Sequence[int | None] | None, n: int) -> list[int | None]:
+    if seed is None:
+        return [None] * n
+    if not isinstance(seed, Sequence | np.ndarray):
+        require_whole("seed", seed)
+        return [int(seed) + i for i in range(n)]
+    require(len(seed) == n, f"seed holds {len(seed)} numbers, want {n}, one for each environment")
+    return list(seed)
+
+
+def _checked(actions: Any, n: int) -> IntArray:
+    actions = np.asarray(actions)
+    if actions.shape != (n,) or actions.dtype.kind not in "iu":
+        raise InputError(
+            f"actions have shape {actions.shape} and type {actions.dtype}, want ({n},) whole numbers"
+        )
+    checked: IntArray = actions.astype(np.int64, copy=False)
+    if (wrong := first_wrong(checked)) >= 0:
+        raise InputError(
+            f"actions[{wrong}] is {checked[wrong]}, want a number from 0 to {PARK} ({', '.join(ACTIONS)})"
+        )
+    return checked
+
+
+def _metrics(address: int, done: BoolArray, scale: float) -> dict[str, Any]:
+    """Return metrics and parts of the rewards of the searches that are done, in the memory of all."""
+    words = np.zeros((len(_OFFSETS), len(done)), np.int64)
+    copy_fields(address, done, _OFFSETS, words)
+    # A type of fewer bytes stands at the beginning of its eight.
+    views = [words.view(dtype)[:, :: 8 // dtype.itemsize] for dtype in _TYPES]
+    metrics: dict[str, Any] = {name: views[dtype][i] for i, (name, dtype) in enumerate(_METRIC_TYPES)}
+    costs = words[len(METRICS) :].view(np.float64)
+    return metrics | dict(zip(REWARD_TERMS, np.multiply(costs, -scale, out=costs), strict=True))
 
 
 def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int], Observer]:

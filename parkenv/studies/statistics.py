@@ -15,8 +15,8 @@ LEAST_PAIRS = 6
 _ROUNDING = 1e-12  # relative difference of values that count as the same
 
 
-def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float, float]:
-    """Compute the mean and bootstrap interval (bias-corrected and accelerated) of a sample.
+def mean_interval(values: ArrayLike) -> tuple[float, float, float]:
+    """Compute the mean and 95 % bootstrap interval (bias-corrected and accelerated) of a sample.
 
     Returns:
         Mean, lower and upper end. The ends equal the mean if all values are the same but for rounding, and are NaN for
@@ -35,7 +35,6 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
     interval = stats.bootstrap(
         (sample,),
         np.mean,
-        confidence_level=confidence,
         n_resamples=RESAMPLES,
         batch=max(1, 4_000_000 // len(sample)),
         rng=np.random.default_rng(0),
@@ -118,9 +117,9 @@ class Estimate(NamedTuple):
     error: float  # its standard error
     freedom: float  # degrees of freedom of the standard error
 
-    def interval(self, confidence: float = 0.95) -> tuple[float, float, float]:
-        """Return the mean and the ends of its interval (Student's t)."""
-        half = self.error * float(stdtrit(self.freedom, (1.0 + confidence) / 2.0)) if self.error else 0.0
+    def interval(self) -> tuple[float, float, float]:
+        """Return the mean and the ends of its 95 % interval (Student's t)."""
+        half = self.error * float(stdtrit(self.freedom, 0.975)) if self.error else 0.0
         return self.mean, self.mean - half, self.mean + half
 
     @classmethod
