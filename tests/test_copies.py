@@ -224,36 +224,10 @@ def test_what_a_caller_does_to_results_changes_nothing_later(kind):
         spoil(result)
 
 
-@pytest.mark.parametrize("mode", AutoresetMode)
-@pytest.mark.parametrize("observation", ["full", "occupancy", "local"])
-def test_a_batch_goes_on_from_a_state_in_which_searches_have_ended(mode, observation):
-    made = [
-        ParkSearchVectorEnv(4, "mini", observation=observation, max_episode_steps=2, autoreset_mode=mode)
-        for _ in range(2)
-    ]
-    envs = made[0]
-    envs.reset(seed=0)
-    for _ in range(2):
-        envs.step(np.full(4, 3))
-    saved, reset = envs.get_state(), {"reset_mask": np.array([True, False, True, True])}
-
-    def go_on(envs):
-        if mode is AutoresetMode.DISABLED:
-            with pytest.raises(gym.error.ResetNeeded):
-                envs.step(np.full(4, 3))
-            return parts((envs.reset(options=reset), envs.reset()))
-        return [parts(envs.step(np.full(4, action))) for action in DRIVEN]
-
-    wanted = go_on(envs)
-    for each in made:
-        each.set_state(saved)
-        assert go_on(each) == wanted
-
-
-@pytest.mark.parametrize("name", ["full", "local", "pictures", "recorded", "places", "drive"])
+@pytest.mark.parametrize("name", ["full", "local", "pictures", "recorded", "places"])
 def test_a_saved_state_is_gone_on_from_in_any_environment_of_its_kind(name):
     """In the middle of another search, and later in its own; the seed of the episodes to come is in it."""
-    world, other = (Drive() if name == "drive" else KINDS[name]() for _ in range(2))
+    world, other = KINDS[name](), KINDS[name]()
     env, another = (getattr(each, "env", each) for each in (world, other))
     world.reset(seed=3)
     world.step(3)

@@ -44,12 +44,11 @@ def random_drive(env, seed, steps=60):
 def placed_at(env, x, y, yaw, speed=0.0):
     """Let the first step begin where the footprint's middle has a pose in the frame of the slot."""
     env.reset(seed=0)
-    episode, state = env.unwrapped.get_state()
+    state = env.unwrapped.state
     sx, sy, syaw = state.task.slot
     c, s = math.cos(syaw), math.sin(syaw)
     middle = np.array([sx + c * x - s * y, sy + s * x + c * y, syaw + yaw])
     state.vehicle[:] = [*CAR.at_rear_axle(middle), speed, 0.0, 0.0]
-    env.unwrapped.set_state((episode, state))
 
 
 @lru_cache
@@ -190,13 +189,6 @@ def test_a_contact_and_leaving_the_area_terminate_are_named_and_cost():
     assert reward == pytest.approx(-CONTROL_S - 200.0)
 
 
-def test_a_state_with_road_users_is_none_of_an_environment_without():
-    env, alone = make("mini", traffic=CROWD).unwrapped, make("mini").unwrapped
-    env.reset(seed=0)
-    with pytest.raises(InputError, match="state has 14 road users, this environment 0"):
-        alone.set_state(env.get_state())
-
-
 @given(seed=st.integers(0, 10_000), lot=st.sampled_from(LOTS))
 @settings(max_examples=60)
 def test_tasks_are_what_they_say(seed, lot):
@@ -284,10 +276,9 @@ def test_others_move_keep_off_a_standing_car_and_are_seen():
 def test_running_into_one_who_moves_is_a_contact(number, word):
     env = make("campus", traffic=CROWD, occupancy=0.0)
     env.reset(seed=1)
-    episode, state = env.unwrapped.get_state()
+    state = env.unwrapped.state
     x, y, _ = state.movers[number]
     state.vehicle[:] = [x - CAR.middle, y, 0.0, 0.0, 0.0, 0.0]
-    env.unwrapped.set_state((episode, state))
     assert CONTACTS[env.step(STILL)[4]["contact"]] == word
 
 

@@ -128,7 +128,7 @@ def test_every_observation_and_attempt_is_true():
     assert n_fresh > 100
 
 
-def test_a_batch_a_saved_state_and_a_pickle_go_on_as_the_single_search_does():
+def test_a_batch_and_pickles_go_on_as_the_single_search_does():
     its = scenario()
     batch, env = ParkSearchVectorEnv(3, its), gym.make("parkenv/Search-v2", scenario=its)
     observations, _ = batch.reset(seed=7)
@@ -141,8 +141,7 @@ def test_a_batch_a_saved_state_and_a_pickle_go_on_as_the_single_search_does():
         observation, reward, *_ = env.step(actions[1])
         assert rewards[1] == reward
         if step == 20:
-            batch.set_state(batch.get_state())
-            env = pickle.loads(pickle.dumps(env))
+            batch, env = pickle.loads(pickle.dumps((batch, env)))
 
 
 @pytest.mark.parametrize("background", ["process", "residents"])

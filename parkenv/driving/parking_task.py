@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import shapely
@@ -346,14 +345,3 @@ class DriveState:
     movers: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     # x, y in m and yaw in rad of the rear axle after each step
     trail: list[tuple[float, float, float]] = field(default_factory=list)
-    seeding: tuple[
-        Any, ...
-    ] = ()  # of a saved state: the environment's generator of random numbers, and its seed
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> DriveState:
-        twin = copy.copy(self)  # a task never changes
-        twin.vehicle = self.vehicle.copy()
-        twin.rng = copy.deepcopy(self.rng, memo)
-        twin.trail = list(self.trail)
-        twin.clocks, twin.movers = self.clocks.copy(), self.movers.copy()
-        return twin

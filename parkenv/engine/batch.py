@@ -104,16 +104,6 @@ class Observer(ABC):
     def observations(self) -> dict[str, NDArray[Any]]:
         return {name: array.copy() for name, array in self.seen.items()}
 
-    def get_state(self) -> tuple[NDArray[Any], ...]:
-        saved = tuple(array.view(np.uint8) if array.dtype.names else array for array in self.searches.save())
-        return (*saved, *(array.copy() for array in self._own.values()))
-
-    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        n = len(state) - len(self._own)
-        self.searches.restore(state[:n])
-        for own, array in zip(self._own.values(), state[n:], strict=True):
-            own[...] = array
-
 
 class BeliefObserver(Observer):
     """The observations of `parkenv/Search-v2`, but for the names in `without`."""

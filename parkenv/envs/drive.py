@@ -1,6 +1,5 @@
 """`parkenv/Drive-v1`: drive a car into a parking slot."""
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -227,24 +226,6 @@ length and width over the car's |
     @property
     def task(self) -> ParkingTask:
         return self.state.task
-
-    def get_state(self) -> tuple[int, DriveState]:
-        state = copy.deepcopy(self.state)
-        state.seeding = copy.deepcopy((self._np_random, self._np_random_seed))
-        return self._episode, state
-
-    def set_state(self, state: tuple[int, DriveState]) -> None:
-        episode, episode_state = state
-        if episode_state.task.vehicle != self.vehicle:
-            raise InputError("state is of another vehicle than this environment's")
-        if len(episode_state.clocks) != self._n_movers:
-            raise InputError(
-                f"state has {len(episode_state.clocks)} road users, this environment {self._n_movers}"
-            )
-        self._episode, self._state = episode, copy.deepcopy(episode_state)
-        if episode_state.seeding:
-            self._np_random, self._np_random_seed = copy.deepcopy(episode_state.seeding)
-        self._enter(self._state)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

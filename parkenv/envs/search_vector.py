@@ -271,20 +271,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         del kwargs
         self._begun = False
 
-    def get_state(self) -> tuple[NDArray[Any], ...]:
-        return (*self.observer.get_state(), self._done.copy())
-
-    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        """Continue from a state that `get_state` returned for the same scenarios and options.
-
-        The worlds are part of it: what follows is the true future once more.
-        """
-        *of_observer, done = state
-        self.observer.set_state(tuple(of_observer))
-        self._begun, self._done = True, done.copy()
-        for search in self._states:
-            search.path = [search.vertex]
-
     def step(
         self, actions: IntArray
     ) -> tuple[dict[str, NDArray[Any]], FloatArray, BoolArray, BoolArray, dict[str, Any]]:

@@ -73,7 +73,7 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
     recorder = _MotionRecorder()
     film = [FrameRecorder(every)] if every else []
     result = simulate(env, agent, seed, (recorder, *film))
-    info, memory, state = result.info, result.memory, recorder.drive.get_state()[1]
+    info, memory, state = result.info, result.memory, recorder.drive.state
     task, (wheel, heading) = state.task, zip(*recorder.motion, strict=True)
     row = {
         "lot": task.lot,
