@@ -246,7 +246,7 @@ def test_the_laser_sees_the_neighbours_and_the_map_of_obstacles_holds_all_that_i
     assert "scan" not in make().reset(seed=3)[0]
     env = make("campus", obstacle_map=True)
     observation, _ = env.reset(seed=3)
-    task = env.unwrapped.task
+    task = env.unwrapped.state.task
     cars = observation["cars"][observation["cars"][:, 0, 0] < 999.0]
     assert len(cars) == (task.obstacles.kind == ObstacleKind.PARKED_CAR).sum()
     lines = observation["lines"][observation["lines"][:, 0, 0] < 999.0]
@@ -308,11 +308,11 @@ def test_actions_and_starts_that_are_none_are_refused():
 def test_a_start_in_collision_is_refused_and_a_free_one_is_taken():
     env = make("mini", occupancy=1.0).unwrapped
     env.reset(seed=0)
-    free = env.task.start[:3] + np.array([0.1, 0.0, 0.0])
+    free = env.state.task.start[:3] + np.array([0.1, 0.0, 0.0])
     env.reset(seed=0, options={"start": free})
-    np.testing.assert_array_equal(env.task.start[:3], free)
+    np.testing.assert_array_equal(env.state.task.start[:3], free)
     lot = env.tasks.lot
-    other = next(i for i in range(lot.n_slots) if lot.slot_ids[i] != env.task.slot_id)
+    other = next(i for i in range(lot.n_slots) if lot.slot_ids[i] != env.state.task.slot_id)
     taken = CAR.at_rear_axle(np.array([*lot.slot_xy[other], lot.slot_yaw[other]]))
     with pytest.raises(InputError, match="the car touches a parked car there, want a free pose"):
         env.reset(seed=0, options={"start": taken})

@@ -345,3 +345,12 @@ class DriveState:
     movers: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     # x, y in m and yaw in rad of the rear axle after each step
     trail: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def count(self, way: float, seconds: float) -> None:
+        """Count a motion of `way`, m, negative backward, that took `seconds`."""
+        self.time += seconds
+        if way != 0.0:
+            direction = 1 if way > 0.0 else -1
+            self.driven_m += abs(way)
+            self.direction_changes += direction == -self.direction
+            self.direction = direction

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -13,20 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
-from parkenv.driving.parking_task import AREA, KINDS, DriveState, ParkingTask, ParkingTasks
+from parkenv.driving.parking_task import AREA, DriveState, ParkingTasks
 from parkenv.driving.road_users import YieldingTraffic
 from parkenv.driving.scene_files import vehicle_of
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
 from parkenv.envs.drive_observation import (
-    CORNERS,
-    FAR,
-    drive_observation_space,
-    fill_observation,
+    DriveObserver,
     goal_error,
     goal_errors,
-    goal_of,
-    obstacle_map,
-    scan_plane,
 )
 from parkenv.errors import InputError, require, require_number, require_one_of, reset_options
 from parkenv.lots import load_lot
@@ -192,26 +186,19 @@ length and width over the car's |
         require(isinstance(traffic, Traffic | None), f"traffic is a {type(traffic).__name__}, want a Traffic")
         self.render_mode = render_mode
         self.vehicle = VehicleParameters() if vehicle is None else vehicle_of(vehicle)
+        lot = lot if isinstance(lot, ParkingLot) else load_lot(lot)
+        near_far = float(distance[0]), float(distance[-1])
+        of_kinds = None if kinds is None else tuple(kinds)
         self.tasks = ParkingTasks(
-            lot if isinstance(lot, ParkingLot) else load_lot(lot),
-            self.vehicle,
-            None if kinds is None else tuple(kinds),
-            tuple(ways),
-            slot,
-            occupancy,
-            slack,
-            (float(distance[0]), float(distance[-1])),
-            starts,
+            lot, self.vehicle, of_kinds, tuple(ways), slot, occupancy, slack, near_far, starts
         )
-        self._dense, self._contact_cost = reward == "dense", float(contact_cost)
+        self._reward = _Reward(reward == "dense", float(contact_cost))
         self.laser = (LaserScanner() if laser else None) if isinstance(laser, bool) else laser
-        self._maps = obstacle_map
         self._traffic = traffic or Traffic()
         self._n_movers = self._traffic.cars + self._traffic.pedestrians
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.observation_space = drive_observation_space(
-            self.vehicle, self.laser, n_movers=self._n_movers, obstacle_map=obstacle_map
-        )
+        self._observer = DriveObserver(self.vehicle, self.laser, self._n_movers, obstacle_map)
+        self.observation_space = self._observer.space
         self._half = np.array([0.5 * self.vehicle.length, 0.5 * self.vehicle.width])
         self._state: DriveState | None = None
         self._episode, self._closed = 0, False
@@ -222,10 +209,6 @@ length and width over the car's |
         if self._state is None:
             raise gym.error.ResetNeeded("the environment has no episode yet: call reset() first")
         return self._state
-
-    @property
-    def task(self) -> ParkingTask:
-        return self.state.task
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -247,7 +230,7 @@ length and width over the car's |
             self.render()
         observation = self._observation()
         self._update_errors(observation)
-        return observation, self._info(self._state, (0.0,) * len(REWARD_TERMS))
+        return observation, _info(self._state, (0.0,) * len(REWARD_TERMS), self._errors)
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         state = self.state
@@ -267,12 +250,7 @@ length and width over the car's |
                 space.move(_between(before, state.movers, (k + 1) / SUBSTEPS))
             way = advance(vehicle, acceleration, steering, limits)
             touched = space.touched(*vehicle[:3].tolist())
-            if way != 0.0:
-                state.driven_m += abs(way)
-                direction = 1 if way > 0.0 else -1
-                state.direction_changes += direction == -state.direction
-                state.direction = direction
-            state.time += PHYSICS_S
+            state.count(way, PHYSICS_S)
             if touched:
                 state.contact = ObstacleKind(touched).label
                 break
@@ -283,23 +261,14 @@ length and width over the car's |
             state.contact = LEFT_AREA
         state.parked = success and not state.contact
         state.over = state.parked or bool(state.contact)
-        terms = self._terms(success, bool(state.contact), self._errors[0], self._errors[1])
-        info = self._info(state, terms)
+        terms = self._reward.terms(success, bool(state.contact), self._errors[0], self._errors[1])
+        info = _info(state, terms, self._errors)
         if self.render_mode == "human":
             self.render()
         return observation, sum(terms), state.over, False, info
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:
-        """Rewards of achieved goals; see the class.
-
-        Args:
-            achieved_goal: (7,) or (n, 7).
-            desired_goal: same shape.
-            info: the step's `info`, or a sequence of n; a missing `contact` means none.
-
-        Returns:
-            A float, or (n,) float32.
-        """
+        """Return the reward of goals of shape (7,), a float, or of n goals and infos, (n,) float32; see the class."""
         achieved, desired = (
             np.atleast_2d(np.asarray(g, dtype=np.float32)) for g in (achieved_goal, desired_goal)
         )
@@ -307,7 +276,7 @@ length and width over the car's |
         infos = [info] * len(achieved) if isinstance(info, Mapping) else info
         rewards = np.array(
             [
-                sum(self._terms(bool(s), bool(i.get("contact")), float(d), float(a)))
+                sum(self._reward.terms(bool(s), bool(i.get("contact")), float(d), float(a)))
                 for d, a, s, i in zip(distance, angle, success, infos, strict=True)
             ]
         )
@@ -353,34 +322,12 @@ length and width over the car's |
         self._space = CollisionWorld(self.vehicle, task.obstacles, movers)
         if len(state.movers):
             self._space.move(state.movers)
-        self._slot = np.array([*task.slot.tolist(), *task.room.tolist()])
-        self._kind = np.array([k == task.kind for k in KINDS], dtype=np.float32)
-        self._desired = goal_of(task)
-        if self.laser is not None:
-            self._plane = scan_plane(task, self._n_movers)
-        if self._maps:
-            self._map = obstacle_map(task)
+        self._observer.enter(task)
 
     def _observation(self) -> dict[str, Any]:
         state = self.state
-        own, achieved = np.empty(12, np.float32), np.empty(7, np.float32)
-        self._away = fill_observation(
-            state.vehicle, self._slot, self._kind, self.vehicle.middle, own, achieved
-        )
-        observation = {"observation": own, "achieved_goal": achieved, "desired_goal": self._desired.copy()}
         outlines = [placed(own, at) for (_, own), at in zip(self._moving(), state.movers, strict=True)]
-        if self.laser is not None:
-            for k, outline in enumerate(outlines):
-                self._plane.replace(self._plane.n_footprints - 1 - k, outline)
-            scan = self.laser.scan(self._plane, self.vehicle.at_middle(state.vehicle[:3]), state.rng)
-            observation["scan"] = np.minimum(scan, np.float32(self.laser.max_range))
-        if self._maps:
-            observation["cars"], observation["lines"] = self._map[0].copy(), self._map[1].copy()
-            observation["vehicle"] = self.vehicle.numbers.copy()
-            if self._n_movers:
-                seen = np.array([np.r_[o, np.repeat(o[-1:], CORNERS - len(o), axis=0)] for o in outlines])
-                seen = np.clip(state.task.in_slot_frame(seen), -FAR, FAR)
-                observation["movers"] = seen.astype(np.float32)
+        observation, self._away = self._observer.observe(state, outlines)
         return observation
 
     def _moving(self) -> list[tuple[ObstacleKind, FloatArray]]:
@@ -392,26 +339,33 @@ length and width over the car's |
         self._errors = distance, angle
         return bool(success)
 
-    def _terms(
+
+class _Reward(NamedTuple):
+    dense: bool
+    contact_cost: float  # s
+
+    def terms(
         self, success: bool, contact: bool, distance: float, angle: float
     ) -> tuple[float, float, float]:
+        """Return `REWARD_TERMS` of a step that ends at a distance, m, and an angle, rad, from the goal."""
         if success and not contact:
             return 0.0, 0.0, 0.0
-        approach = -CONTROL_S * (distance / 10.0 + angle / math.pi) if self._dense else 0.0
-        return -CONTROL_S, approach, -self._contact_cost if contact else 0.0
+        approach = -CONTROL_S * (distance / 10.0 + angle / math.pi) if self.dense else 0.0
+        return -CONTROL_S, approach, -self.contact_cost if contact else 0.0
 
-    def _info(self, state: DriveState, terms: Sequence[float]) -> dict[str, Any]:
-        return {
-            **dict(zip(REWARD_TERMS, terms, strict=True)),
-            "is_success": state.parked,
-            "contact": CONTACTS.index(state.contact),
-            "time_s": state.time,
-            "driven_m": state.driven_m,
-            "direction_changes": state.direction_changes,
-            "position_error_m": self._errors[0],
-            "angle_error_rad": self._errors[1],
-            "parked": state.parked,
-        }
+
+def _info(state: DriveState, terms: Sequence[float], errors: tuple[float, float]) -> dict[str, Any]:
+    return {
+        **dict(zip(REWARD_TERMS, terms, strict=True)),
+        "is_success": state.parked,
+        "contact": CONTACTS.index(state.contact),
+        "time_s": state.time,
+        "driven_m": state.driven_m,
+        "direction_changes": state.direction_changes,
+        "position_error_m": errors[0],
+        "angle_error_rad": errors[1],
+        "parked": state.parked,
+    }
 
 
 def _between(before: FloatArray, after: FloatArray, share: float) -> FloatArray:

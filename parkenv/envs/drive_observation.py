@@ -1,6 +1,7 @@
 """Observations and goals of `parkenv/Drive-v1`: space, own state, laser scene, obstacle map, errors of a goal."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.collision_world import ObstacleKind
-from parkenv.driving.parking_task import REACH, ParkingTask
+from parkenv.driving.parking_task import KINDS, REACH, DriveState, ParkingTask
 from parkenv.driving.vehicle import VehicleParameters
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
@@ -24,28 +25,63 @@ STANDING = 0.05  # speed, m/s, up to which a car counts as standing
 BOUND = 2.0 * REACH  # bound of positions in the observation, m
 
 
-def drive_observation_space(
-    vehicle: VehicleParameters, laser: LaserScanner | None, *, n_movers: int, obstacle_map: bool
-) -> spaces.Dict:
-    fastest = max(vehicle.max_speed, vehicle.max_reverse_speed)
-    goal = np.array([BOUND, BOUND, 1.0, 1.0, fastest, BOUND, BOUND], dtype=np.float32)
-    strongest = max(vehicle.max_braking, vehicle.max_acceleration)
-    own = np.r_[goal[:5], vehicle.max_steering, strongest, BOUND, BOUND, 1.0, 1.0, 1.0]
-    own = (own * (1.0 + 1e-6)).astype(np.float32)
-    shown: dict[str, spaces.Space[Any]] = {
-        "observation": spaces.Box(-own, own, dtype=np.float32),
-        "achieved_goal": spaces.Box(-goal, goal, dtype=np.float32),
-        "desired_goal": spaces.Box(-goal, goal, dtype=np.float32),
-    }
-    if laser is not None:
-        shown["scan"] = spaces.Box(0.0, laser.max_range, (laser.n_beams,), np.float32)
-    if obstacle_map:
-        shown["cars"] = spaces.Box(-FAR, FAR, (MOST_CARS, CORNERS, 2), np.float32)
-        shown["lines"] = spaces.Box(-FAR, FAR, (MOST_LINES, 2, 2), np.float32)
-        shown["vehicle"] = spaces.Box(0.0, 1000.0, vehicle.numbers.shape, np.float32)
-        if n_movers:
-            shown["movers"] = spaces.Box(-FAR, FAR, (n_movers, CORNERS, 2), np.float32)
-    return spaces.Dict(shown)
+class DriveObserver:
+    """What a car observes in a parking task: see the environment."""
+
+    def __init__(
+        self, vehicle: VehicleParameters, laser: LaserScanner | None, n_movers: int, has_map: bool
+    ) -> None:
+        self._vehicle, self._laser, self._n_movers, self._has_map = vehicle, laser, n_movers, has_map
+        fastest = max(vehicle.max_speed, vehicle.max_reverse_speed)
+        goal = np.array([BOUND, BOUND, 1.0, 1.0, fastest, BOUND, BOUND], dtype=np.float32)
+        strongest = max(vehicle.max_braking, vehicle.max_acceleration)
+        own = np.r_[goal[:5], vehicle.max_steering, strongest, BOUND, BOUND, 1.0, 1.0, 1.0]
+        own = (own * (1.0 + 1e-6)).astype(np.float32)
+        shown: dict[str, spaces.Space[Any]] = {
+            "observation": spaces.Box(-own, own, dtype=np.float32),
+            "achieved_goal": spaces.Box(-goal, goal, dtype=np.float32),
+            "desired_goal": spaces.Box(-goal, goal, dtype=np.float32),
+        }
+        if laser is not None:
+            shown["scan"] = spaces.Box(0.0, laser.max_range, (laser.n_beams,), np.float32)
+        if has_map:
+            shown["cars"] = spaces.Box(-FAR, FAR, (MOST_CARS, CORNERS, 2), np.float32)
+            shown["lines"] = spaces.Box(-FAR, FAR, (MOST_LINES, 2, 2), np.float32)
+            shown["vehicle"] = spaces.Box(0.0, 1000.0, vehicle.numbers.shape, np.float32)
+            if n_movers:
+                shown["movers"] = spaces.Box(-FAR, FAR, (n_movers, CORNERS, 2), np.float32)
+        self.space = spaces.Dict(shown)
+
+    def enter(self, task: ParkingTask) -> None:
+        self._slot = np.array([*task.slot.tolist(), *task.room.tolist()])
+        self._kind = np.array([kind == task.kind for kind in KINDS], dtype=np.float32)
+        self._desired = goal_of(task)
+        if self._laser is not None:
+            self._plane = scan_plane(task, self._n_movers)
+        if self._has_map:
+            self._map = obstacle_map(task)
+
+    def observe(self, state: DriveState, movers: Sequence[FloatArray]) -> tuple[dict[str, Any], float]:
+        """Return the observation among the outlines of moving road users, and the distance from the slot along x or y.
+
+        The laser draws its noise from the state's generator.
+        """
+        own, achieved = np.empty(12, np.float32), np.empty(7, np.float32)
+        away = fill_observation(state.vehicle, self._slot, self._kind, self._vehicle.middle, own, achieved)
+        observation = {"observation": own, "achieved_goal": achieved, "desired_goal": self._desired.copy()}
+        if self._laser is not None:
+            for k, outline in enumerate(movers):
+                self._plane.replace(self._plane.n_footprints - 1 - k, outline)
+            scan = self._laser.scan(self._plane, self._vehicle.at_middle(state.vehicle[:3]), state.rng)
+            observation["scan"] = np.minimum(scan, np.float32(self._laser.max_range))
+        if self._has_map:
+            observation["cars"], observation["lines"] = self._map[0].copy(), self._map[1].copy()
+            observation["vehicle"] = self._vehicle.numbers.copy()
+            if self._n_movers:
+                seen = np.array([np.r_[o, np.repeat(o[-1:], CORNERS - len(o), axis=0)] for o in movers])
+                seen = np.clip(state.task.in_slot_frame(seen), -FAR, FAR)
+                observation["movers"] = seen.astype(np.float32)
+        return observation, away
 
 
 @compiled(error_model="numpy")
