@@ -1,7 +1,7 @@
 """`parkenv/Search-v2`: search a parking lot for a free slot."""
 
-from collections.abc import Callable
-from copy import deepcopy
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy, deepcopy
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -36,15 +36,76 @@ if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
 
 _REBUILT = {
-    "searches", "scenario", "_state", "_address", "_copiers", "_copy_cues", "_scenario_index", "_step", "_copy_mask",
-    "_copy_masks", "_seeded_with", "_begun", "_over",
+    "searches", "scenario", "_state", "_address", "_scenario_index", "_step", "_seeded_with", "_begun", "_over"
 }  # fmt: skip
+
+
+NO_RENDER_MODE = 'render() does nothing without a render_mode, e.g. gym.make(..., render_mode="rgb_array")'
 
 
 class SavedSearch(NamedTuple):
     arrays: tuple[NDArray[Any], ...]
     path: list[int]
     seeding: tuple[Any, ...] = ()  # the environment's generator of random numbers, and its seed
+
+
+class SearchObserver:
+    """What one search observes: `full`, `occupancy` or `local`, as a dictionary or one vector, in the space `space`."""
+
+    def __init__(self, scenarios: Sequence[Scenario], observation: str, k: int | None, *, flat: bool) -> None:
+        require_one_of("observation", observation, OBSERVATIONS)
+        require(k is None or observation == "local", f"k is {k!r}, want None unless observation is local")
+        space, self._around = space_of(scenarios), None
+        if observation == "occupancy":
+            space = spaces.Dict({name: box for name, box in space.items() if name not in BELIEF_PARTS})
+        elif observation == "local":
+            k = NEAR_SLOTS if k is None else k
+            self._around, space = Surroundings.of(scenarios, k), local_space(k)
+        self._flat = FlatLayout(space) if flat else None
+        self.space: Any = space if self._flat is None else self._flat.space
+        self._is_full = observation == "full" and not flat
+        self._vertices = list(np.arange(max(scenario.lot.n_vertices for scenario in scenarios)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        attached = "_address", "_copiers", "_copy_cues", "_masks", "_mask"
+        return {name: value for name, value in vars(self).items() if name not in attached}
+
+    def attach(self, searches: Searches, scenarios: Sequence[Scenario]) -> None:
+        """Observe the first of some searches in these scenarios; `enter` says in which it is."""
+        self._address = searches.address
+        self._copiers, self._copy_cues = searches.copiers(0), searches.copier_of_cues(0)
+        self._masks = [[mask.copy for mask in scenario.action_masks] for scenario in scenarios]
+
+    def enter(self, scenario_index: int) -> None:
+        self._mask = self._masks[scenario_index]
+
+    def observe(self, vertex: int) -> Any:
+        if not self._is_full:
+            smaller = self._smaller(vertex)
+            return smaller if self._flat is None else self._flat(smaller)
+        time, p_occupied, belief, step_observed, day_error = self._copiers
+        observation = {
+            "vertex": self._vertices[vertex],
+            "time": time(),
+            "p_occupied": p_occupied(),
+            "belief": belief(),
+            "step_observed": step_observed(),
+            "day_error": day_error(),
+            "action_mask": self._mask[vertex](),
+        }
+        if self._copy_cues is not None:
+            observation["cues"] = self._copy_cues()
+        return observation
+
+    def _smaller(self, vertex: int) -> dict[str, Any]:
+        mask = self._mask[vertex]()
+        if self._around is not None:
+            local = np.empty(self._around.n_numbers, np.float32)
+            observe_surroundings_at(self._address, self._around, local)
+            return {"local": local, "action_mask": mask}
+        time, p_occupied, _, _, day_error = self._copiers
+        observation = {"vertex": self._vertices[vertex], "time": time(), "p_occupied": p_occupied()}
+        return {**observation, "day_error": day_error(), "action_mask": mask}
 
 
 class SearchEnv(gym.Env[dict[str, Any], np.int64]):
@@ -131,14 +192,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ## Episode end
     - Terminated: parked; or the lot is *proven full*: every slot was observed in this search, and taken when last
       observed. Then the search ends with the give-up penalty `give_up_s`, the time to park elsewhere.
-    - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`); Gymnasium's wrapper
-      repeats it at every step until the next reset.
-    - `close()` ends the episode, too.
+    - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`).
 
     `info` holds numbers under the same keys after reset and step: the episode's metrics so far, drive_s, failed_s,
     walk_s, parking_cost_s, gave_up_s, total_s, driven_m, walked_m, failed_parks, slots_passed (slots whose vertex the
-    car stopped at) and parked; scenario_index; and the parts of the reward. The step count of a time-limit wrapper is
-    not part of `get_state`.
+    car stopped at) and parked; scenario_index; and the parts of the reward.
 
     ## Several scenarios
     With several scenarios, each episode is in one of them, drawn from the seed and the number of the episode: the same
@@ -147,23 +205,13 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     smaller ones, slots past the last are taken (1) and never observed. `observation="local"` has the same size on
     every lot.
 
-    ```python
-    >>> import gymnasium as gym
-    >>> import parkenv
-    >>> env = gym.make("parkenv/Search-v2", scenario=["campus", "street", "mini"], observation="local")
-    >>> [env.reset(seed=seed)[1]["scenario_index"] for seed in range(5)]
-    [2, 0, 1, 0, 0]
-
-    ```
-
     ## Keys
     For `gymnasium.utils.play.play(env, wait_on_player=True, noop=4)` (needs the extra `human`): w, s, a, d drive up,
     down, left, right; space parks.
 
     ## Arguments
-    - `scenario`: a `Scenario`; the name of a packaged one: campus, jam, street, mini; a scenario file (.toml); a lot
-      (.geojson), with a week and days as in busy real car parks; a folder of such files; or a sequence of
-      these. See `parkenv.make_scenarios`.
+    - `scenario`: a name (campus, jam, street, mini), a scenario file (.toml), a lot (.geojson; with days as in busy
+      real car parks), a folder of these, a `Scenario`, or a sequence of these; see `parkenv.make_scenarios`.
     - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`. A frame shows which
       slots are truly taken, hidden from the agent, and as colours the agent's belief.
     - `observation`: `full`, as above; `occupancy`, the same without `belief` and `step_observed`; or `local`, a `Dict`
@@ -179,8 +227,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     >>> import parkenv
     >>> env = gym.make("parkenv/Search-v2", scenario="mini", failure_s=5.0)
     >>> observation, info = env.reset(seed=0)
-    >>> observation["p_occupied"].shape, env.action_space.n
-    ((10,), np.int64(5))
     >>> observation, reward, terminated, truncated, info = env.step(3)
     >>> bool(np.isclose(reward, sum(info[name] for name in info if name.startswith("reward_"))))
     True
@@ -212,39 +258,22 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         **changes: Any,
     ) -> None:
         require_one_of("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        require_one_of("observation", observation, OBSERVATIONS)
         require_changes((type(self),), changes)
-        require(k is None or observation == "local", f"k is {k!r}, want None unless observation is local")
         require_number("reward_scale", reward_scale, above=0.0)
         self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.render_mode = render_mode
         self.action_space = spaces.Discrete(len(ACTIONS))
-        self.observation_space = space_of(self.scenarios)
-        self._is_full = observation == "full"
-        self._around: Surroundings | None = None
-        if observation == "occupancy":
-            self.observation_space = spaces.Dict(
-                {name: box for name, box in self.observation_space.items() if name not in BELIEF_PARTS}
-            )
-        elif observation == "local":
-            k = NEAR_SLOTS if k is None else k
-            self._around, self.observation_space = Surroundings.of(self.scenarios, k), local_space(k)
-        self._flat: FlatLayout | None = None
-        if flat:
-            self._flat = FlatLayout(self.observation_space)
-            self.observation_space = self._flat.space  # type: ignore[assignment]
-            self._is_full = False
+        self._observer = SearchObserver(self.scenarios, observation, k, flat=flat)
+        self.observation_space = self._observer.space
         self.reward_scale = float(reward_scale)
-        self._vertices = list(np.arange(max(scenario.lot.n_vertices for scenario in self.scenarios)))
         self._renderer: SearchRenderer | None = None
         self._make_search()
 
     def _make_search(self) -> None:
         self.searches = Searches(ScenarioRecords(self.scenarios), 1, full_belief=True)
-        self._address, self._needs_python = self.searches.address, self.searches.needs_python
+        self._address = self.searches.address
         self._state = SearchState(self.searches)
-        self._copiers, self._copy_cues = self.searches.copiers(0), self.searches.copier_of_cues(0)
-        self._copy_masks = [[mask.copy for mask in scenario.action_masks] for scenario in self.scenarios]
+        self._observer.attach(self.searches, self.scenarios)
         self._scenario_index = -1
         self._enter_scenario()
         self._seeded_with: int | None = None
@@ -252,12 +281,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def _enter_scenario(self) -> None:
         index = int(self.searches.records["scenario_index"][0])
-        if index == self._scenario_index:
-            return
-        self._scenario_index, self.scenario = index, self.scenarios[index]
-        self._is_exact = self.scenario.observes_exactly
-        self._copy_mask = self._copy_masks[index]
-        self._close_window()
+        if index != self._scenario_index:
+            self._scenario_index, self.scenario = index, self.scenarios[index]
+            self._is_exact = self.scenario.observes_exactly
+            self._observer.enter(index)
+            self._close_window()
 
     @property
     def state(self) -> SearchState:
@@ -289,6 +317,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def __setstate__(self, content: dict[str, Any]) -> None:
         saved = content.pop("saved")
         self.__dict__.update(content)
+        self._observer = copy(self._observer)
         self._make_search()
         if saved is not None:
             self.set_state(saved)
@@ -306,19 +335,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if seed is not None or self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
             record["seed_state"] = seed_state(self.np_random_seed)
-        if starts:
-            before = record.copy()
-            try:
-                choose_start(self.searches, 0, int(record["episode"]), starts)
-            except InputError:
-                self.searches.records[0] = (
-                    before  # so that no later reset uses what was valid of these options
-                )
-                raise
-        begin_search_at(self._address)
-        if self.searches.needs_python:
-            self.searches.complete_arrival(0)
-            init_full_prior_at(self._address)
+        _begin(self.searches, starts)
         self._enter_scenario()
         if self.scenario.live_slots.size:
             observe_live_at(self._address)
@@ -336,8 +353,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         number = action_number(action)
         # A wrapper's time limit may end the episode at any step, so every step has the metrics.
         reward, over, vertex, info = read_step(self._scenario_index, self._step(self._address, number))
-        if self._needs_python:
-            raise_error()
+        raise_error()
         path = self._state.path
         if vertex != path[-1]:
             path.append(vertex)
@@ -358,9 +374,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def render(self) -> Any:
         if self.render_mode is None:
-            gym.logger.warn(
-                'render() does nothing without a render_mode, e.g. gym.make(..., render_mode="rgb_array")'
-            )
+            gym.logger.warn(NO_RENDER_MODE)
             return None
         if self._renderer is None:
             from parkenv.show.frames.search import SearchRenderer
@@ -392,32 +406,22 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._renderer = None
 
     def _observation(self, vertex: int) -> Any:
-        if not self._is_full:
-            smaller = self._smaller_observation(vertex)
-            return smaller if self._flat is None else self._flat(smaller)
-        time, p_occupied, belief, step_observed, day_error = self._copiers
-        observation = {
-            "vertex": self._vertices[vertex],
-            "time": time(),
-            "p_occupied": p_occupied(),
-            "belief": belief(),
-            "step_observed": step_observed(),
-            "day_error": day_error(),
-            "action_mask": self._copy_mask[vertex](),
-        }
-        if self._copy_cues is not None:
-            observation["cues"] = self._copy_cues()
-        return observation
+        return self._observer.observe(vertex)
 
-    def _smaller_observation(self, vertex: int) -> dict[str, Any]:
-        mask = self._copy_mask[vertex]()
-        if self._around is not None:
-            local = np.empty(self._around.n_numbers, np.float32)
-            observe_surroundings_at(self._address, self._around, local)
-            return {"local": local, "action_mask": mask}
-        time, p_occupied, _, _, day_error = self._copiers
-        observation = {"vertex": self._vertices[vertex], "time": time(), "p_occupied": p_occupied()}
-        return {**observation, "day_error": day_error(), "action_mask": mask}
+
+def _begin(searches: Searches, starts: Mapping[str, Any]) -> None:
+    record, address = searches.records[0], searches.address
+    if starts:
+        before = record.copy()
+        try:
+            choose_start(searches, 0, int(record["episode"]), starts)
+        except InputError:
+            searches.records[0] = before  # so that no later reset uses what was valid of these options
+            raise
+    begin_search_at(address)
+    if searches.needs_python:
+        searches.complete_arrival(0)
+        init_full_prior_at(address)
 
 
 @cache
