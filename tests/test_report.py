@@ -158,12 +158,11 @@ def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
 
 
 def test_learning_curves_are_those_of_the_training(tmp_path):
-    """Other trainings are shown by their medians."""
     for seed, text in ((3, "steps,total_s\n0,0.25\n500,0.5\n"), (4, "step,total_s\n0,1\n")):
         (tmp_path / f"seed_{seed}").mkdir()
         (tmp_path / f"seed_{seed}" / "curve.csv").write_text(text)
     curve = [
-        {"steps": steps, "total_s": value, "low_s": None, "high_s": None, "median_s": value - 0.125}
+        {"steps": steps, "total_s": value, "low_s": None, "high_s": None}
         for steps, value in ((0.0, 0.25), (500.0, 0.5))
     ]
     summary_in(
@@ -172,7 +171,6 @@ def test_learning_curves_are_those_of_the_training(tmp_path):
         rows=[{"agent": "ppo", "scenario": "campus,street", "seed": k, "total_s": 0.5} for k in (3, 4)],
         evaluated={"mdp": 80.0, "clairvoyant bound": 60.0},
         curve=curve,
-        beside={"dqn": curve},
     )
     data = RunFolder.read(tmp_path).data()
     assert data["run"]["title"] == "ppo trained on campus and street"
@@ -180,7 +178,6 @@ def test_learning_curves_are_those_of_the_training(tmp_path):
     assert panel["title"] == "total time, s"
     assert panel["mean"] == [[0.0, 0.25, None, None], [500.0, 0.5, None, None]]
     assert panel["seeds"] == [[[0.0, 0.25], [500.0, 0.5]], []], "a curve without steps is not drawn"
-    assert panel["beside"] == [["dqn", [[0.0, 0.125], [500.0, 0.375]]]]
     assert panel["lines"] == [["mdp", 80.0], ["clairvoyant bound", 60.0]]
 
 

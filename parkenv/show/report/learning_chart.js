@@ -3,9 +3,6 @@
 /** Times above this multiple of the least one are off the chart: an untrained policy drives in circles. */
 const OFF_CHART = 2;
 
-/** Colours of other trainings. */
-const BESIDE = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#888888"];
-
 /** Move positions apart to a least distance, in order, as little as possible. */
 function spread(positions, apart) {
   const placed = [...positions];
@@ -21,10 +18,9 @@ function spread(positions, apart) {
   return placed;
 }
 
-function learningPanel({ title, mean, seeds, beside, lines }, width) {
+function learningPanel({ title, mean, seeds, lines }, width) {
   const [height, left, right, top, bottom] = [340, 46, 150, 10, 34];
-  const others = beside.map(([name, points], i) => ({ name, points, color: BESIDE[i % BESIDE.length] }));
-  const curves = [...seeds, ...others.map(({ points }) => points)].flat();
+  const curves = seeds.flat();
   const steps = Math.max(...mean.map((point) => point[0]), ...curves.map((point) => point[0]), 1);
   const all = [...mean.map((point) => point[1]), ...curves.map((point) => point[1]), ...lines.map((line) => line[1])].filter((value) => value !== null);
   let [low, high] = [Math.min(...all), Math.max(...all)];
@@ -56,17 +52,16 @@ function learningPanel({ title, mean, seeds, beside, lines }, width) {
   const sure = mean.filter((point) => point[2] !== null && point[3] !== null && point[2] !== undefined);
   if (sure.length > 1) drawn.append(makeSvg("path", { d: `${path(sure.map((p) => [p[0], p[3]]))}${path([...sure].reverse().map((p) => [p[0], p[2]])).replace("M", "L")}Z`, style: "fill: var(--drive); opacity: 0.18" }));
   for (const its of seeds) drawn.append(makeSvg("path", { d: path(its), style: "fill: none; stroke: var(--drive); stroke-width: 1; opacity: 0.4" }));
-  for (const { points, color } of others) drawn.append(makeSvg("path", { d: path(points), style: `fill: none; stroke: ${color}; stroke-width: 2` }));
   drawn.append(makeSvg("path", { d: path(mean.map((p) => [p[0], p[1]])), style: "fill: none; stroke: var(--drive); stroke-width: 2.6; stroke-linejoin: round" }));
   svg.append(drawn);
   const last = mean[mean.length - 1][1];
-  const labels = [...lines.map(([name, value]) => ({ name, value })), ...others.map(({ points, color }) => ({ name: "", value: points[points.length - 1][1], color })), { name: others.length ? "" : "trained", value: last, strong: true }].filter(({ value }) => value <= high && value >= low);
+  const labels = [...lines.map(([name, value]) => ({ name, value })), { name: "trained", value: last, strong: true }].filter(({ value }) => value <= high && value >= low);
   labels.sort((a, b) => b.value - a.value);
   const heights = spread(labels.map(({ value }) => y(value)), 17);
-  labels.forEach(({ name, value, strong, color }, i) => {
-    if (!strong && !color) svg.append(makeSvg("line", { class: "bound", x1: left, x2: width - right, y1: y(value), y2: y(value) }));
+  labels.forEach(({ name, value, strong }, i) => {
+    if (!strong) svg.append(makeSvg("line", { class: "bound", x1: left, x2: width - right, y1: y(value), y2: y(value) }));
     svg.append(makeSvg("path", { d: `M${width - right + 2} ${y(value)}L${width - right + 12} ${heights[i]}`, style: "fill: none; stroke: var(--faint); stroke-width: 0.8" }));
-    text(`${name ? `${name}  ` : ""}${written(value, 1)}`, { x: width - right + 16, y: heights[i] + 4, class: strong ? "lead" : "strong", style: color ? `fill: ${color}` : "" });
+    text(`${name}  ${written(value, 1)}`, { x: width - right + 16, y: heights[i] + 4, class: strong ? "lead" : "strong" });
   });
   return svg;
 }
@@ -76,11 +71,8 @@ function showLearning(root, panels) {
   const grid = make("div", { class: panels.length > 1 ? "grid" : "single" });
   const width = Math.min(Math.max(root.clientWidth / Math.min(panels.length, 2) - 40, 420), 1200);
   for (const panel of panels) grid.append(make("div", {}, make("h3", {}, panel.title), learningPanel(panel, width)));
-  const beside = panels[0].beside.map(([name]) => name);
-  const key = (color, name) => make("span", { class: "key" }, make("span", { class: "swatch", style: `background: ${color}` }), name);
-  const keys = beside.length ? [key("var(--drive)", "this training"), ...beside.map((name, i) => key(BESIDE[i % BESIDE.length], name))] : [];
   root.append(
-    make("p", { class: "quiet" }, `Evaluations during training, in held-out worlds: the mean over ${n} training${n > 1 ? "s with its 95 % interval, each training as a thin line" : ""}${beside.length ? "; medians of other trainings in colour" : ""}. Dashed: other agents in the same worlds.`),
-    make("div", { class: "card chart" }, grid, make("div", { class: "legend" }, ...keys)),
+    make("p", { class: "quiet" }, `Evaluations during training, in held-out worlds: the mean over ${n} training${n > 1 ? "s with its 95 % interval, each training as a thin line" : ""}. Dashed: other agents in the same worlds.`),
+    make("div", { class: "card chart" }, grid),
   );
 }

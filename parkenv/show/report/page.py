@@ -161,8 +161,7 @@ def _webp(picture: PillowImage.Image, *, chart: bool) -> str:
 def learning_panels(summary: Row, seeds: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
     """Return the panel of learning curves, of rows of each seed's `curve.csv`; none without curves.
 
-    A point of the mean is decisions, mean, and the ends of its 95 % interval (None for one seed). Other trainings show
-    their median, which is robust against single searches that drive in circles.
+    A point of the mean is decisions, mean, and the ends of its 95 % interval (None for one seed).
     """
     curve, lines = summary.get("curve"), summary.get("evaluated")
     if not curve or not isinstance(lines, Mapping):
@@ -175,7 +174,6 @@ def learning_panels(summary: Row, seeds: Sequence[Sequence[Row]]) -> list[dict[s
         "title": "total time, s",
         "mean": points(curve, "total_s", "low_s", "high_s"),
         "seeds": [points([r for r in rows if {"steps", "total_s"} <= r.keys()], "total_s") for rows in seeds],
-        "beside": [[name, points(rows, "median_s")] for name, rows in summary.get("beside", {}).items()],
         "lines": [[name, value] for name, value in lines.items()],
     }]  # fmt: skip
 
