@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.perception.monocular import GroundView
-from parkenv.perception.pipeline import CameraView, PerceptionResult
+from parkenv.perception.pipeline import PerceptionResult
 from parkenv.world.lot import Mouth, ParkingLot
 
 WEIGHTS = {"picture": -0.26, "red": 1.33, "white": 1.04, "both": 1.72, "moved": 2.98, "person": 0.6}
@@ -30,18 +29,8 @@ _SHOWN = 0.25  # fraction of the end of a car that a picture must show
 _OVERHANG_M, _PERSON_M = 0.4, 0.9
 
 
-class _Picture(NamedTuple):
-    image: NDArray[np.uint8]
-    ground: GroundView
-    at: FloatArray  # (2,) m, the camera in the world
-    ahead: FloatArray  # (2,) direction of its view; likewise to its right
-    aside: FloatArray
-
-    @classmethod
-    def of(cls, view: CameraView, vehicle: FloatArray) -> Self:
-        x, y, yaw = view.mount.in_world(vehicle)
-        ahead, aside = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])
-        return cls(view.image, GroundView(view.camera, view.mount), np.array([x, y]), ahead, aside)
+# Image, its projection, and x, y in m and yaw in rad of its camera in the world.
+_Picture = tuple[NDArray[np.uint8], GroundView, float, float, float]
 
 
 class DepartureCues:
@@ -64,7 +53,11 @@ class DepartureCues:
         """Return the features of cars in slots, (k, n) as in `WEIGHTS`, from one or two captures, oldest first."""
         scans = [_points(result) for result in newest]
         # What the newest capture does not show, the one before may.
-        pictures = [_Picture.of(view, result.vehicle) for result in newest[::-1] for view in result.views]
+        pictures: list[_Picture] = [
+            (view.image, GroundView(view.camera, view.mount), *view.mount.in_world(result.vehicle))
+            for result in newest[::-1]
+            for view in result.views
+        ]
         rows = np.zeros((len(slots), len(WEIGHTS)))
         for row, slot in zip(rows, slots.tolist(), strict=True):
             outs = [self._outline(points, slot) for points in scans]
@@ -103,9 +96,10 @@ class DepartureCues:
             + corner[:, :1] * out
             + corner[:, 1:] * self._half_width[slot] * self._side[slot]
         )
-        for image, ground, at, ahead, aside in pictures:
-            forward, right = (xy - at) @ ahead, (xy - at) @ aside
-            if forward.min() > 0.5 and (at - self._mouth[slot]) @ out > 0.0:
+        for image, ground, x, y, yaw in pictures:
+            heading = np.array([math.cos(yaw), math.sin(yaw)])
+            forward, right = (xy - [x, y]) @ heading, (xy - [x, y]) @ [heading[1], -heading[0]]
+            if forward.min() > 0.5 and ([x, y] - self._mouth[slot]) @ out > 0.0:
                 corners = [ground.pixels(forward, right, np.full(4, z)) for z in _LAMPS_M]
                 pixels = _within(image, np.concatenate(corners))
                 if len(pixels) >= _LEAST_PIXELS:
