@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -33,7 +34,7 @@ from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import WIDE
 from sim_sensors.scene import Scene
-from sim_sensors.slot_scenes import scene_of_slots
+from sim_sensors.slot_scenes import SlotLot, slot_surroundings
 
 Scans = Callable[[FloatArray], NDArray[Any]]  # maps poses, (n, 3), to ranges, (n, n_beams), m
 
@@ -202,7 +203,9 @@ def parked_cars(seed: int = 0) -> Scene:
     xy = np.stack(np.meshgrid(x, rows), -1).reshape(-1, 2)
     yaw = np.where(xy[:, 1] > 0.0, math.pi / 2, -math.pi / 2)
     lane = np.array([[x[0], 0.0], [x[-1], 0.0]])
-    return scene_of_slots(xy, yaw, 5.0, 2.55, np.ones(len(xy), dtype=bool), lanes=[lane], seed=seed)
+    lot = SlotLot(xy, yaw, 5.0, 2.55, seed=seed)
+    lot = dataclasses.replace(lot, surroundings=slot_surroundings(lot, [lane], seed=seed))
+    return lot.scene(np.ones(len(xy), dtype=bool))
 
 
 def walled_lot(

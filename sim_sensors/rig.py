@@ -227,13 +227,7 @@ class SensorRig:
         return SensorRig(lasers=self.lasers)
 
     def capture(
-        self,
-        scene: Sensed,
-        pose: ArrayLike,
-        weather: Weather | None = None,
-        seed: int = 0,
-        *,
-        noise: bool = True,
+        self, scene: Sensed, pose: ArrayLike, weather: Weather | None = None, seed: int = 0
     ) -> Capture:
         """Measure with every sensor at one pose; equal arguments give equal results.
 
@@ -242,7 +236,6 @@ class SensorRig:
             pose: (3,) x, y in m and yaw in rad of the vehicle, world frame.
             weather: the light; None: a sunny day.
             seed: seed of the noise of all sensors.
-            noise: whether laser ranges have noise; images always do.
 
         Raises:
             SensorError: the pose is not three finite numbers, or a sensor raised an error.
@@ -257,7 +250,7 @@ class SensorRig:
             eye = mount.camera_pose(vehicle)
             pairs[name] = stereo.render_stereo(scene, eye, weather, _seed_of(seed, 1, i))
         for i, (name, laser, mount) in enumerate(self.lasers):
-            rng = np.random.default_rng([seed, 2, i]) if noise else None
+            rng = np.random.default_rng([seed, 2, i])
             scans[name] = laser.scan(scene.scan_plane, mount.in_world(vehicle), rng)
         return Capture(vehicle, images, pairs, scans)
 

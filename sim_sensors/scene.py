@@ -106,7 +106,7 @@ class Scene:
     """Vehicles in numbered places, and their surroundings. World frame, SI units.
 
     A place may be empty, so the ids of other vehicles do not change when a vehicle leaves. Make a scene with
-    `from_arrays`, or from parking slots with `slot_scenes.scene_of_slots`.
+    `from_arrays`, or from parking slots with `slot_scenes.SlotLot`.
 
     Args:
         vehicle_pose: (n, 3) float64: x, y in m, yaw in rad, of each place.

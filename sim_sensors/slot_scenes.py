@@ -210,29 +210,3 @@ def slot_lines(lot: SlotLot) -> FloatArray:
     middle = np.round((table[:, :2] + table[:, 2:]) / 2 / 0.15)
     once = np.sort(np.unique(middle, axis=0, return_index=True)[1])
     return np.column_stack([table[once], np.full(len(once), LINE_M)])
-
-
-def scene_of_slots(
-    slot_xy: ArrayLike,
-    slot_yaw: ArrayLike,
-    slot_length: ArrayLike,
-    slot_width: ArrayLike,
-    occupied: ArrayLike,
-    *,
-    kerbside: ArrayLike = False,
-    arrivals: ArrayLike = 0,
-    lanes: Sequence[ArrayLike] = (),
-    seed: int = 0,
-    manners: ParkingManners | None = None,
-    **surroundings: object,
-) -> Scene:
-    """Make a scene of parking slots and their occupancy in one call; see `SlotLot` and `SlotLot.scene`.
-
-    Lanes, polylines (k, 2) m, are paved; `surroundings` are fields of `Surroundings`: walls, buildings, trees and so
-    on.
-    """
-    lot = SlotLot(
-        slot_xy, slot_yaw, slot_length, slot_width, kerbside, None, manners or ParkingManners(), seed=seed
-    )
-    around = slot_surroundings(lot, lanes, **{"seed": seed, **surroundings})
-    return replace(lot, surroundings=around).scene(occupied, arrivals)

