@@ -44,7 +44,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import LINE, float64s, in_one_block, int32s, int64s
 from parkenv.engine.kernel import enter
@@ -189,10 +189,9 @@ class FollowedSearch:
         if begins is not None:
             self._search.begin_outside(begins, observation)
         local = np.empty(self._n_numbers, np.float32)
-        parts = (observation[name] for name in ("time", "p_occupied", "belief", "step_observed"))
-        vertex = int(observation["vertex"])
-        cues = observation.get("cues", np.empty(0, np.float32))
-        follow_at(self._search.address, self._around, begins is not None, vertex, *parts, cues, local)
+        vertex, cues = int(observation["vertex"]), observation.get("cues", np.empty(0, np.float32))
+        parts = (*(observation[name] for name in ("time", "p_occupied", "belief", "step_observed")), cues)
+        follow_at(self._search.address, self._around, begins is not None, vertex, parts, local)
         return {"local": local, "action_mask": observation["action_mask"]}
 
 
@@ -202,13 +201,10 @@ def follow_at(
     around: Surroundings,
     begins: bool,
     vertex: int,
-    time: NDArray[np.float32],
-    p_occupied: NDArray[np.float32],
-    belief: NDArray[np.float32],
-    step_observed: NDArray[np.float32],
-    cues: NDArray[np.float32],
-    local: NDArray[np.float32],
+    parts: tuple[Float32Array, ...],
+    local: Float32Array,
 ) -> None:
+    time, p_occupied, belief, step_observed, cues = parts
     search, n, most = search_at(address, 0), p_occupied.size, step_observed.size // 4
     if begins:
         enter(search, np.uint64(0), 0, 0.0, 0.0, vertex)
