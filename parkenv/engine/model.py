@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from parkenv.belief.day_belief import UNINFORMATIVE_SLOT_PROBABILITY, DayBelief, independent_share
+from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of, call_at
@@ -224,13 +224,10 @@ class Model:
     Args:
         problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept. Live counts of
             facilities are refused.
-        any_day: whether days may be unlike their forecast, with the probabilities of `belief` (`DayBelief`): an event
-            has filled the slots near the goal, or the forecast carries no information, of the day or of single slots.
-            `sample` draws all slots from such a day; their later changes follow the forecast.
     """
 
-    def __init__(self, problem: SearchProblem, any_day: bool = False) -> None:
-        self.problem, self._any_day = problem.public(), any_day
+    def __init__(self, problem: SearchProblem) -> None:
+        self.problem = problem.public()
         require(
             len(self.problem.live_slots) == 0,
             f"lot {self.problem.lot.name!r} has live counts, want one without them",
@@ -253,13 +250,9 @@ class Model:
         forecast = np.clip(slots.forecast, MIN_PROBABILITY, MAX_PROBABILITY)
         error = DayError(*(float(deviation) for deviation in seen.day_error))
         near, days = nearness(self.problem.walk_s), _Days.of(error)
-        if self._any_day:
-            share = independent_share(self.problem.lot.facility_of_slot)
-            day = DayBelief(slots, near, doubt=UNINFORMATIVE_SLOT_PROBABILITY, evidence=share)
-        else:
-            centre = centred_logits(forecast, error.deviations(near))
-            logits = centre[:, None] + days.level + near[:, None] * days.slope
-            day = DayBelief(slots, near, hypotheses=(days.weight, 1.0 / (1.0 + np.exp(-logits))))
+        centre = centred_logits(forecast, error.deviations(near))
+        logits = centre[:, None] + days.level + near[:, None] * days.slope
+        day = DayBelief(slots, near, hypotheses=(days.weight, 1.0 / (1.0 + np.exp(-logits))))
         day.update(_last_observations(slots, forecast))
         rate, hours = np.clip(slots.decay_rate, _LEAST_RATE, MAX_RATE), np.ones(WEEK_HOURS)
         world = OccupancyProcess(forecast * rate, hours, (1.0 - forecast) * rate, hours, error, near)
@@ -284,22 +277,17 @@ class Model:
         require_whole("n", n)
         require_whole("copies", copies, least=1)
         slots = np.flatnonzero(belief.slots.observed)
-        n_observed, level, slope = len(slots), np.zeros(n), np.zeros(n)
-        if self._any_day:
-            # These days are no level and slope, so all slots are drawn now.
-            slots = np.concatenate([slots, np.flatnonzero(~belief.slots.observed)])
         p_day, p_taken = belief.day.on_days(slots, belief.slots.time)
         day = rng.choice(len(p_day), n, p=p_day)
-        if not self._any_day:
-            days = belief._days
-            level = days.level[day] + days.widths[0] * (rng.random(n) - 0.5)
-            slope = days.slope[day] + days.widths[1] * (rng.random(n) - 0.5)
+        days = belief._days
+        level = days.level[day] + days.widths[0] * (rng.random(n) - 0.5)
+        slope = days.slope[day] + days.widths[1] * (rng.random(n) - 0.5)
         taken = rng.random((n, len(slots))) < p_taken.T[day]
         keys, rows = rng.integers(2**64, size=n, dtype=np.uint64), np.tile(np.arange(n), copies)
         drawn = Simulations(belief._tables, n * copies)
         _sample_at(
             drawn.searches.address, keys[rows], belief.vertex, belief.arrival, belief.slots.time, belief.n_steps,
-            np.exp(level)[rows], slope[rows], slots, taken[rows], n_observed, belief.last_taken[slots],
+            np.exp(level)[rows], slope[rows], slots, taken[rows], belief.last_taken[slots],
             belief.slots.p_observed[slots], belief.slots.observed_at[slots],
             *self._announced(belief.slots, slots, taken, rng, rows),
         )  # fmt: skip
@@ -400,12 +388,11 @@ class Model:
         )
 
 
-def model(scenario: SearchProblem, any_day: bool = False) -> Model:
+def model(scenario: SearchProblem) -> Model:
     """Return the generative model of a search, on which planners are built; see the page "Write a planner".
 
     Args:
         scenario: the scenario, of which the model keeps the public part, or a problem.
-        any_day: see `Model`.
 
     Examples:
         >>> import gymnasium as gym
@@ -419,7 +406,7 @@ def model(scenario: SearchProblem, any_day: bool = False) -> Model:
         >>> model.update(belief, 3, seen).vertex == seen.vertex
         True
     """
-    return Model(scenario, any_day)
+    return Model(scenario)
 
 
 def _last_observations(slots: SlotBelief, forecast: FloatArray) -> Observations:
@@ -468,17 +455,13 @@ def _sample_at(
     day_slope: FloatArray,
     slots: IntArray,
     taken: BoolArray,
-    n_observed: int,
     last_taken: BoolArray,
     p_observed: FloatArray,
     observed_at: FloatArray,
     excess: FloatArray,
     announced: BoolArray,
 ) -> None:
-    """Put a search into the situation of a belief, in a world of which the day and some slots are given.
-
-    The first of these slots have been observed.
-    """
+    """Put a search into the situation of a belief, in a world of which the day and the observed slots are given."""
     for e in range(len(keys)):
         search = search_at(address, e)
         search.scenario, search.scenario_index = search.scenarios, 0
@@ -488,8 +471,7 @@ def _sample_at(
         search.time, search.n_steps = arrival + time, n_steps
         for i in range(len(slots)):
             column = column_of(search, slots[i])
-            if i < n_observed:
-                set_belief_of(search, column, last_taken[i], p_observed[i], arrival + observed_at[i])
+            set_belief_of(search, column, last_taken[i], p_observed[i], arrival + observed_at[i])
             record = slot_at(search.slots, column)
             if record.valid_until < np.inf:
                 # What comes does not depend on when the state began.
