@@ -31,7 +31,6 @@ from parkenv.world.lot import ACTIONS
 from parkenv.world.scenario import SearchProblem
 from planners.names import ALGORITHMS
 
-SUFFIX = ".safetensors"
 CARD_KEY = "parkenv"  # key of the card in the metadata
 _MAX_HEADER = 1_000_000
 # Version of the layout of `parkenv.engine.local_observation`, which search models observe.

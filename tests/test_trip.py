@@ -121,7 +121,7 @@ def test_a_rounded_polyline_ends_where_the_polyline_does_and_turns_no_tighter_th
 def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(speed, turn):
     points = np.array([[0.0, 0.0], [20.0, 0.0], [20.0 + 20.0 * math.cos(turn), 20.0 * math.sin(turn)]])
     path = rounded(points, 6.0)
-    keeper = LaneKeeper(CAR, path, TrackingSettings(speed=4.0, blend_m=2.0, firmness=0.5), aside=1.5)
+    keeper = LaneKeeper(CAR, path, TrackingSettings(speed=4.0, blend_m=2.0, firmness=0.5))
     state = np.zeros(6)
     state[SPEED] = speed
     poses = path.sampled(0.05)[0]

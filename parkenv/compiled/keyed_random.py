@@ -105,10 +105,10 @@ def car_key(world: np.uint64, car: int) -> np.uint64:
 
 
 @compiled
-def car_uniforms(world: np.uint64, stream: int, first: int, values: NDArray[np.float64]) -> None:
-    """Fill an array with the uniform numbers of the cars from `first` on, index 0 of the stream each."""
+def car_uniforms(world: np.uint64, stream: int, values: NDArray[np.float64]) -> None:
+    """Fill an array with the uniform numbers of the cars, index 0 of the stream each."""
     for i in range(len(values)):
-        values[i] = keyed_uniform(world, stream, first + i, 0)
+        values[i] = keyed_uniform(world, stream, i, 0)
 
 
 def named_key(key: np.uint64, name: str) -> np.uint64:

@@ -119,8 +119,8 @@ def _arrays(item: Any) -> Any:
 
 
 # In compiled code, `float64_array(address, (m, n))` is the array at an address.
-float64_array, int64_array, int32_array = _arrays(types.float64), _arrays(types.int64), _arrays(types.int32)
-uint8_array = _arrays(types.uint8)
+float64_array, uint8_array = _arrays(types.float64), _arrays(types.uint8)
+int64_array, int32_array = _arrays(types.int64), _arrays(types.int32)
 
 
 @intrinsic

@@ -9,12 +9,13 @@ from pydantic import Field, InstanceOf
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from parkenv.compiled.keyed_random import SLOT_STREAM, car_uniforms
+from parkenv.compiled.keyed_random import SLOT_STREAM
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.engine.records import BACKGROUNDS, CAR, DUE, NO_SLOT
 from parkenv.errors import InputError, require_one_of
 from parkenv.files.field_types import NotNegative, Validated, Whole
 from parkenv.files.known_names import KNOWLEDGE
+from parkenv.world.arrivals import uniforms
 from parkenv.world.demand import CarPlans, Demand, TownDemand
 from parkenv.world.occupancy.process import ArrivalDay
 from parkenv.world.scenario import Drivers, Scenario, drive_times, zone_prices
@@ -200,8 +201,7 @@ class FleetCars:
 
     def _slots_of_parked(self, parked: BoolArray, demand: Demand | TownDemand, key: np.uint64) -> IntArray:
         cars, lot = self.records[parked], self._scenario.lot
-        slots, u = np.empty(len(cars), np.int64), np.empty(len(cars))
-        car_uniforms(key, SLOT_STREAM, 0, u)
+        slots, u = np.empty(len(cars), np.int64), uniforms(key, SLOT_STREAM, len(cars))
         costs = (
             np.zeros((len(self.records), len(lot.zones))) if self.zone_cost_s is None else self.zone_cost_s
         )

@@ -46,7 +46,7 @@ TAKE_SLOT = 16
 
 
 class PolicyData:
-    """The data of a compiled policy for one fleet, such as tables: a record of numbers and addresses.
+    """The data of a compiled policy for one fleet, its tables: a record of numbers and addresses.
 
     Attributes:
         record: (1,) of the dtype.

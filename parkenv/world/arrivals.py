@@ -246,7 +246,7 @@ def hours_between(start_s: float, end_s: float) -> FloatArray:
 
 def uniforms(key: np.uint64, stream: int, n: int) -> FloatArray:
     values = np.empty(n)
-    car_uniforms(key, stream, 0, values)
+    car_uniforms(key, stream, values)
     return values
 
 

@@ -16,7 +16,7 @@ from parkenv.errors import require
 from planners.agent import predict_each
 from planners.driving.car_path import CarPath
 from planners.driving.hybrid_astar import SearchSettings, plan_path, why_no_path
-from planners.driving.path_tracking import PathTracker, TrackingSettings
+from planners.driving.path_tracking import PathTracker
 
 MOST_PLANS = 12
 """Maximum number of plans per episode; after that the car stays where it is."""
@@ -63,20 +63,15 @@ class ParkingAgent:
     Args:
         vehicle: the car.
         search: settings of the planner.
-        tracking: settings of the controller.
     """
 
     name = "planner"
 
     def __init__(
-        self,
-        vehicle: VehicleParameters | None = None,
-        search: SearchSettings | None = None,
-        tracking: TrackingSettings | None = None,
+        self, vehicle: VehicleParameters | None = None, search: SearchSettings | None = None
     ) -> None:
         self.vehicle = vehicle or VehicleParameters()
         self.search = search or SearchSettings()
-        self.tracking = tracking or TrackingSettings()
 
     def predict(
         self,
@@ -147,7 +142,7 @@ class ParkingAgent:
             memory.planning_s.append(time.perf_counter() - began)
             if path is not None and len(path.length):
                 memory.paths.append(path)
-                memory.tracker = PathTracker(self.vehicle, path, self.tracking)
+                memory.tracker = PathTracker(self.vehicle, path)
                 return np.array(memory.tracker.command(pose, speed, steering), dtype=np.float32)
         if not waits and not memory.reason:
             of_plans = f"{MOST_PLANS} paths did not lead into the slot"

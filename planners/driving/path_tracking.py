@@ -67,6 +67,7 @@ _AIMED = 0.02  # rad, of the wheels, before the car sets off
 _STANDS = 0.01  # m/s
 _RATE_SHARE = 0.8  # share of the steering rate available to the path; the rest is for corrections
 _REACTION_S = 0.2
+_ASIDE = 1.8  # m/s², greatest acceleration to the side on a lane
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,21 +190,17 @@ class PathTracker:
 
 
 class LaneKeeper(PathTracker):
-    """Follow a path on a lane, starting at the current speed, with at most `aside` m/s² to the side in turns."""
+    """Follow a path on a lane, starting at the current speed, and slow down in turns."""
 
     def __init__(
-        self,
-        vehicle: VehicleParameters,
-        path: CarPath,
-        settings: TrackingSettings | None = None,
-        aside: float = 1.8,
+        self, vehicle: VehicleParameters, path: CarPath, settings: TrackingSettings | None = None
     ) -> None:
         super().__init__(vehicle, path, settings)
         self._set_off = True
         most = 1.5 * self._settings.acceleration
         for segment in self._segments:
             bend = np.maximum(np.abs(segment.curvature), 1e-6)
-            np.minimum(segment.pace, np.sqrt(aside / bend), out=segment.pace)
+            np.minimum(segment.pace, np.sqrt(_ASIDE / bend), out=segment.pace)
             _brake_ahead(segment.pace, segment.station, most)
 
 

@@ -12,6 +12,8 @@ from parkenv.errors import require
 from parkenv.world.lot import PARK
 from planners.thesis.mdp import ParkingMDP
 
+MOST_ITERATIONS = 10_000
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -22,9 +24,7 @@ class Solution:
     iterations: int  # number of rounds of the solver
 
 
-def policy_iteration(
-    mdp: ParkingMDP, policy: NDArray[np.int64] | None = None, *, max_iterations: int = 10_000
-) -> Solution:
+def policy_iteration(mdp: ParkingMDP, policy: NDArray[np.int64] | None = None) -> Solution:
     """Alternate evaluation by sparse LU (eq. 3.29) and greedy improvement (eq. 3.30).
 
     Stops when the policy no longer changes. If actions differ only by rounding, the current one is kept, so ties cannot
@@ -33,11 +33,10 @@ def policy_iteration(
     Args:
         mdp: the process; gamma must be below 1, since a policy that never parks has no finite value at 1.
         policy: (n,) initial policy, for a warm start; None: park everywhere.
-        max_iterations: maximum number of rounds.
 
     Raises:
         InputError: gamma is 1, or the policy has the wrong shape.
-        RuntimeError: not converged within `max_iterations`.
+        RuntimeError: not converged within `MOST_ITERATIONS`.
     """
     require(
         mdp.gamma < 1.0,
@@ -48,7 +47,7 @@ def policy_iteration(
     rewards, successors, continuation = mdp.rewards(), mdp.successors(), mdp.continuation()
     policy = np.full(n, PARK, dtype=np.int64) if policy is None else np.array(policy, dtype=np.int64)
     require(policy.shape == (n,), f"policy has shape {policy.shape}, want ({n},)")
-    for iteration in range(1, max_iterations + 1):
+    for iteration in range(1, MOST_ITERATIONS + 1):
         weights = np.concatenate([np.ones(n), -continuation[state, policy]])
         entries = np.concatenate([state, state]), np.concatenate([state, successors[state, policy]])
         system = csc_array((weights, entries), shape=(n, n))
@@ -59,4 +58,4 @@ def policy_iteration(
         if not better.any():
             return Solution(values, policy, iteration)
         policy = np.where(better, q.argmax(axis=1), policy)
-    raise RuntimeError(f"policy iteration did not converge within {max_iterations} iterations")
+    raise RuntimeError(f"policy iteration did not converge within {MOST_ITERATIONS} iterations")
