@@ -100,6 +100,7 @@ class SearchVecEnv(VecEnv):  # type: ignore[misc]
         return observations, (rewards * self.reward_scale).astype(np.float32), done, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
+        """Return the actions that are possible now, (n, 5) bool."""
         return self._masks.copy()
 
     def close(self) -> None:
