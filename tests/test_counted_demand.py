@@ -41,9 +41,7 @@ def a_map(folder):
         95, 210, 115, 230, {"amenity": "parking"}, capacity="80", fee="no", access="customers",
         opening_hours="Mo-Fr 08:00-18:00",
     )  # fmt: skip
-    place.box(
-        370, 305, 390, 325, {"amenity": "parking", "parking": "multi-storey", "name": "P0"}, capacity="30"
-    )
+    place.box(370, 305, 390, 325, {"amenity": "parking", "parking": "multi-storey"}, name="P0", capacity="30")
     place.way([(200, 200), (150, 150)], STREET)
     (folder / "town.osm").write_text(place.xml(), encoding="utf-8")
     return folder / "town.osm"
@@ -78,9 +76,8 @@ def test_only_streets_that_cars_need_are_left_and_no_way_is_longer(tmp_path):
     drives = []
     for _, lanes in (streets.lanes(doors), streets.lanes(doors, entries)):
         drawn = Slots.joined([NO_SLOTS]).columns()
-        lot = ParkingLot(
-            "doors", (), **drawn, lanes=tuple(lanes), entries=entries, goals=doors[:1], facilities=facilities
-        )
+        drawn |= {"lanes": tuple(lanes), "entries": entries, "goals": doors[:1]}
+        lot = ParkingLot("doors", (), **drawn, facilities=facilities)
         ends = np.r_[lot.entry_vertices, np.arange(lot.n_slots)]
         metres = sum(np.hypot(*np.diff(lane.points, axis=0).T).sum() for lane in lanes)
         drives.append((metres, drive_times(make_scenario(lot), ends)))

@@ -43,9 +43,8 @@ def slanted():
 
 
 def street_nearer():
-    place = car_park().way(
-        [(-60, 10), (-4, 10), (-4, 60)], {"highway": "residential"}, **{"parking:left": "lane"}
-    )
+    tags = {"highway": "residential", "parking:left": "lane"}
+    place = car_park().way([(-60, 10), (-4, 10), (-4, 60)], tags)
     return place.way([(-4, 10), (55, 10.0)], {"highway": "unclassified"})
 
 
@@ -166,14 +165,8 @@ def car_parks():
     p1 = {"amenity": "parking", "name": "P1", "capacity": "77", "capacity:disabled": "4"}
     place = grid(**NONE).way([(20, 20), (60, 20), (60, 60), (20, 60)], p1)
     place.box(80, 20, 120, 60, {"amenity": "parking", "name": "P2", "access": "private"})
-    garage = {
-        "amenity": "parking",
-        "name": "P3",
-        "parking": "multi-storey",
-        "fee": "yes",
-        "building:levels": "3",
-    }
-    place.box(140, 20, 180, 60, garage)
+    garage = {"amenity": "parking", "parking": "multi-storey", "fee": "yes", "building:levels": "3"}
+    place.box(140, 20, 180, 60, garage, name="P3")
     return place.node(160, 62, amenity="parking_entrance").node(230, 230, amenity="parking", name="P4")
 
 
@@ -193,13 +186,11 @@ def entrances():
     return place.node(230, 30, amenity="parking_entrance", capacity="80")
 
 
-ODD = {
-    "amenity": "parking",
-    "capacity:hgv": "4",
-    "access:times": "Mo",
-    "opening_hours:covid19": "off",
-    "charge:rate": "2",
-}
+UNREAD = {"parking:both": "lane", "parking:left:times": "Mo-Fr", "parking:left:orientation": "diagonal"}
+UNREAD |= {"parking:lane:both:conditional": "no @ (We)", f"{RIGHT}:maxstay:conditional": "1 h @ (Mo-Fr)"}
+ODD = {"amenity": "parking", "capacity": "9", "access": "yes", "access:times": "Mo", "fee:note": "x"}
+ODD |= {"capacity:hgv": "4", "opening_hours:covid19": "off", "charge:rate": "2"}
+ODD |= {"maxstay:conditional": "1 h @ (Mo)"}
 TOWNS = {
     "streets: apart": grid()
     .way([(2500, 1400), (2550, 1400)], STREET, name="Inselweg")
@@ -218,20 +209,7 @@ TOWNS = {
     .box(1000, 1000, 1040, 1040, {"amenity": "parking"})
     .box(90, 90, 95, 95, {"amenity": "parking", "access": "no"}),
     "garages: entrances": entrances(),
-    "rules: keys that nobody reads": grid(
-        **{
-            "parking:both": "lane",
-            "parking:left:times": "Mo-Fr",
-            "parking:lane:both:conditional": "no @ (We)",
-        },
-        **{f"{RIGHT}:maxstay:conditional": "1 h @ (Mo-Fr)", "parking:left:orientation": "diagonal"},
-    ).box(
-        20,
-        20,
-        60,
-        50,
-        ODD | {"capacity": "9", "access": "yes", "maxstay:conditional": "1 h @ (Mo)", "fee:note": "x"},
-    ),
+    "rules: keys that nobody reads": grid(**UNREAD).box(20, 20, 60, 50, ODD),
     "goals: along streets": Map()
     .way([(0, 0), (300, 0)], STREET, **{"parking:both": "lane"})
     .way([(0, 90), (300, 90)], STREET, **{"parking:both": "lane"})

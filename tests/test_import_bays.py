@@ -81,8 +81,7 @@ def test_meters_become_slots_on_their_side_of_their_street(
     tmp_path_factory, angle, half_width, noise, oneway, left_hand, seed
 ):
     """A generated street of known kerbs, meters with noise: all keep id, side and place; the lane keeps its way."""
-    tmp_path = tmp_path_factory.mktemp("town")
-    turn = np.radians(angle)
+    tmp_path, turn = tmp_path_factory.mktemp("town"), np.radians(angle)
     along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
     ends = [tuple((s * along).round(3).tolist()) for s in (-180, 0, 180)]
     place = Map().way(ends, {"highway": "tertiary"}, **({"oneway": "yes"} if oneway else {}))
@@ -90,8 +89,7 @@ def test_meters_become_slots_on_their_side_of_their_street(
         [ends[0], *(tuple((s * along + 150 * across).round(3).tolist()) for s in (-180, 180)), ends[2]],
         {"highway": "tertiary"},
     )
-    rng = np.random.default_rng(seed)
-    side = np.repeat([-1.0, 1.0], 40)
+    rng, side = np.random.default_rng(seed), np.repeat([-1.0, 1.0], 40)
     station = np.tile(-150 + 7.0 * np.arange(40), 2)
     true = station[:, None] * along + (half_width * side)[:, None] * across
     bays = meters(tmp_path / "bays.csv", true + rng.uniform(-noise, noise, true.shape))
@@ -218,8 +216,7 @@ def test_the_command_writes_the_lot_and_what_is_left_out(tmp_path):
     assert "9 of 10 bays, 90 %, stand on a street" in said.stdout
     missing = [{"reason": "bays without a street within 20 m", "id": "A9"}]
     assert rows_in(tmp_path / "lot.left_out.csv") == missing
-    lot = read_lot(out)
-    assert set(lot.slot_ids) == {f"A{k}" for k in range(9)}
+    assert set(read_lot(out).slot_ids) == {f"A{k}" for k in range(9)}
     assert not any(problem.severity == "error" for problem in check_lot(out))
     assert "--columns wants --bays" in refused("lot import", streets, "--columns", "lat=y", "--out", out)
     beside = ("lot", "import", str(streets), "--bays", str(bays), "--out", str(bays.with_suffix(".geojson")))

@@ -104,8 +104,7 @@ def test_given_entries_and_goals_count_by_metres_or_degrees(tmp_path):
 def test_without_goal_or_entry_it_refuses_and_says_how_to_give_one(tmp_path):
     place = Map().way([(0, 0), (50, 0)], AISLE).box(10, 3, 12.5, 8, SPACE).box(13, 3, 15.5, 8, SPACE)
     draft = place.draft(tmp_path)
-    assert len(draft.slots) == 2
-    assert len(draft.missing) == 2
+    assert (len(draft.slots), len(draft.missing)) == (2, 2)
     with pytest.raises(InputError, match=r"no entry: .*--entry LAT,LON; lanes end at .*no goal: .*--goal"):
         draft.lot()
     problems = check_lot(tmp_path / "place.osm")
@@ -160,9 +159,7 @@ FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "named"), [(name, *fault) for name, fault in FAULTS.items()], ids=FAULTS
-)
+@pytest.mark.parametrize(("name", "text", "named"), [(n, *fault) for n, fault in FAULTS.items()], ids=FAULTS)
 def test_faults_are_named_in_one_line(tmp_path, name, text, named):
     path = tmp_path / name
     path.write_text(text(), encoding="utf-8")
@@ -259,9 +256,8 @@ def test_every_slot_is_tied_to_a_lane_before_its_mouth(tmp_path, turn, aisle, n,
     outward = mouth - lot.slot_xy
     assert ((outward * to_lane).sum(axis=1) > 0).all()
     boxes = shapely.polygons(lot.slot_corners())
-    assert not shapely.intersects(
-        boxes, shapely.union_all([shapely.LineString(lane.points) for lane in lot.lanes])
-    ).any()
+    lanes = shapely.union_all([shapely.LineString(lane.points) for lane in lot.lanes])
+    assert not shapely.intersects(boxes, lanes).any()
 
 
 def test_the_command_line_imports_draws_and_checks(tmp_path):

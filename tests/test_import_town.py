@@ -29,12 +29,7 @@ from parkenv.lots.osm.conditions import Charge, charge_in, closed_parking, durat
 from parkenv.lots.osm.elements import read_map
 from parkenv.lots.osm.roads import closed_to_cars, whole_number
 from parkenv.lots.town.draft import import_town
-from parkenv.lots.town.supply import (
-    PLACES_PER_METRE,
-    Rules,
-    kerb_rules,
-    rules_of,
-)
+from parkenv.lots.town.supply import PLACES_PER_METRE, Rules, kerb_rules, rules_of
 from parkenv.scenarios.spec import lot_scenario
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.drive_graph import build_drive_graph
@@ -167,12 +162,10 @@ def test_what_cannot_be_read_is_listed(tmp_path):
     place = grid(**{"parking:both": "no"})
     tags = {"amenity": "parking", "capacity": "a few", "opening_hours": "Mo-Fr bis 20:00", "maxstay": "brief"}
     place.box(20, 20, 60, 60, tags, name="P1").box(80, 20, 120, 60, tags, name="P2", charge="2 EUR")
-    place.box(
-        140, 20, 180, 60, {"amenity": "parking", "capacity": "30", "capacity:disabled": "30"}, name="P3"
-    )
+    third = {"amenity": "parking", "capacity": "30", "capacity:disabled": "30"}
+    place.box(140, 20, 180, 60, third, name="P3")
     path, out = place.write(tmp_path / "town.osm"), tmp_path / "town.geojson"
-    done = ran("lot", "import", path, "--town", "--out", out)
-    assert "by area and levels" in done.stdout
+    assert "by area and levels" in ran("lot", "import", path, "--town", "--out", out).stdout
     rows = rows_in(tmp_path / "town.unread.csv")
     assert [(row["tag"], row["value"], row["count"], row["assumed"]) for row in rows] == [
         ("capacity", "a few", "2", "by area and levels"),

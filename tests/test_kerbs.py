@@ -28,8 +28,7 @@ def test_the_share_taken_by_hour_is_that_of_the_law(process, kind, days):
 
 
 def test_block_faces_differ_and_opposite_ones_are_alike(process):
-    lot = packaged_lot("kerbs")
-    faces, face = np.unique(lot.slot_facility, return_inverse=True)
+    faces, face = np.unique(packaged_lot("kerbs").slot_facility, return_inverse=True)
     bays = np.bincount(face)
     assert (bays.min(), bays.max()) == (4, 24)
     popularity = np.log(process.arrival_factor / process.departure_factor)

@@ -58,9 +58,7 @@ def test_a_slot_knows_its_corners_and_its_mouth():
     np.testing.assert_allclose(lot.mouth_xy(), [[10.0, 3.0]])
     np.testing.assert_allclose(lot.slot_corners(), [[[11.25, 3.0], [11.25, 8.0], [8.75, 8.0], [8.75, 3.0]]])
     np.testing.assert_allclose(lot.walk_m(), [np.hypot(10.0, 4.5)])
-    assert lot.bounds() == (0.0, 0.0, 20.0, 10.0)
-    assert lot.n_slots == 1
-    assert lot.n_vertices == 3
+    assert (lot.bounds(), lot.n_slots, lot.n_vertices) == ((0.0, 0.0, 20.0, 10.0), 1, 3)
 
 
 def test_a_lot_is_read_only_and_compares_and_pickles_by_what_it_holds():
@@ -111,8 +109,7 @@ def test_city_has_exactly_the_slots_asked_for_and_every_place_leads_to_every_oth
 def test_city_is_that_of_its_seed_and_numbers_neighbours_near_each_other():
     assert city_lot(300, seed=1) == city_lot(300, seed=1)
     assert city_lot(300, seed=1) != city_lot(300, seed=2)
-    lot = city_lot(5000, seed=0)
-    step = np.hypot(*np.diff(lot.slot_xy, axis=0).T)
+    step = np.hypot(*np.diff(city_lot(5000, seed=0).slot_xy, axis=0).T)
     assert np.median(step) < 10.0
     assert np.mean(step) < 60.0
 
@@ -181,8 +178,7 @@ def test_edges_have_the_speed_of_their_lane_also_behind_an_entry():
     graph = graph_of(lanes, [(10, -3), (10, 3), (50, -3)], entries=((20.0, 0.0),))
     for vertex, row in enumerate(graph.neighbors.tolist()):
         for column, target in enumerate(row):
-            ends = graph.vertex_xy[[vertex, target], 0]
-            fast = target >= 0 and ends.mean() < 30.0
+            fast = target >= 0 and graph.vertex_xy[[vertex, target], 0].mean() < 30.0
             assert graph.edge_speed[vertex, column] == (2.0 if fast else 1.0)
 
 
@@ -221,8 +217,7 @@ def test_loops_can_be_driven_round_and_are_no_edges_to_themselves():
     g = nx.DiGraph(sorted(moves(graph)))
     assert nx.is_strongly_connected(g)
     assert not any(i == j for i, j in moves(graph))
-    total = sum(graph.edge_length[graph.neighbors >= 0])
-    assert total == pytest.approx(100.0)
+    assert sum(graph.edge_length[graph.neighbors >= 0]) == pytest.approx(100.0)
     graph = graph_of([([(-20, 0), (0, 0)], TWO_WAY), ([(0, 0), (10, 5), (10, -5), (0, 0)], TWO_WAY)])
     assert not any(i == j for i, j in moves(graph))
     assert nx.is_strongly_connected(nx.DiGraph(sorted(moves(graph))))
@@ -240,8 +235,7 @@ def test_points_closer_than_the_tolerance_are_one_junction_wherever_they_lie():
     # 0.0005 m is where rounding to the tolerance would part the two points.
     near = 0.0005
     lanes = [([(-20, 0), (near - 1e-9, 0)], TWO_WAY), ([(near + 1e-9, 0), (20, 0)], TWO_WAY)]
-    graph = graph_of(lanes, entries=[(-20, 0)])
-    assert len(graph.vertex_xy) == 3
+    assert len(graph_of(lanes, entries=[(-20, 0)]).vertex_xy) == 3
     apart = graph_of([lanes[0], ([(3 * NODE_TOLERANCE, 0), (20, 0)], TWO_WAY)], entries=[(-20, 0)])
     assert len(apart.vertex_xy) == 4
 

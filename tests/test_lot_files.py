@@ -21,6 +21,7 @@ from parkenv.lots.lot_files import check_lot
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 PACKAGED = Path(__file__).parents[1] / "parkenv" / "lots" / "packaged"
+LEFT, RIGHT = Mouth.LEFT, Mouth.RIGHT
 points = st.tuples(*[st.floats(-1e6, 1e6)] * 2)
 
 
@@ -68,22 +69,17 @@ def with_exact(slot, **changes):
 
 @settings(max_examples=15)
 @given(
-    rows=st.integers(1, 5),
-    columns=st.integers(1, 5),
-    pitch=st.floats(2.0, 4.0),
-    aisle=st.floats(3.0, 9.0),
+    size=st.tuples(st.integers(1, 5), st.integers(1, 5), st.floats(2.0, 4.0), st.floats(3.0, 9.0)),
     turn=st.floats(-4.0, 4.0),
-    shift=points,
+    at=st.tuples(points, points),
     name=st.text().filter(is_plain),
-    goal=points,
     walls=st.lists(st.lists(points, min_size=2, max_size=5), max_size=3),
     speed=st.floats(0.25, 4.0),
     cost=st.just(0.0) | st.floats(0.0, 1e8),
     zone=st.text(alphabet="centre, 1=ä", max_size=8),
 )
-def test_written_lots_are_read_back_to_the_bit(
-    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls, speed, cost, zone
-):
+def test_written_lots_are_read_back_to_the_bit(tmp_path, size, turn, at, name, walls, speed, cost, zone):
+    (rows, columns, pitch, aisle), (shift, goal) = size, at
     grid = grid_lot(rows, columns, name=name, pitch=pitch, aisle=aisle)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
 
@@ -94,10 +90,7 @@ def test_written_lots_are_read_back_to_the_bit(
         grid,
         slot_xy=moved(grid.slot_xy),
         slot_yaw=grid.slot_yaw + turn,
-        lanes=tuple(
-            Lane(moved(lane.points), oneway, speed)
-            for lane, oneway in zip(grid.lanes, [True] + [False] * 9, strict=False)
-        ),
+        lanes=tuple(Lane(moved(lane.points), k == 0, speed) for k, lane in enumerate(grid.lanes)),
         entries=moved(grid.entries),
         goals=[goal],
         walls=tuple(map(np.array, walls)),
@@ -131,24 +124,21 @@ def test_files_that_cannot_be_written_or_read_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         write_lot(packaged_lot("mini"), tmp_path / "nowhere" / "lot.geojson")
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(InputError, match="No such file"):
-        read_lot(tmp_path / "lot.geojson")
-    with pytest.raises(InputError, match=r"unknown kind of file '\.osm'"):
-        read_lot(tmp_path / "lot.osm")
+    assert "No such file" in refusal(read_lot, tmp_path / "lot.geojson")
+    assert "unknown kind of file '.osm'" in refusal(read_lot, tmp_path / "lot.osm")
     with pytest.raises(InputError, match=r"not JSON: .* at line 1 column"):
         read(tmp_path, json.dumps(document())[:-37])
     (tmp_path / "lot.json").write_bytes(b'{"name": "\xff"}')
-    with pytest.raises(InputError, match="not UTF-8 text"):
-        read_lot(tmp_path / "lot.json")
+    assert "not UTF-8 text" in refusal(read_lot, tmp_path / "lot.json")
 
 
 @pytest.mark.parametrize(
     ("y", "oneway", "mouth", "yaw"),
     [
-        (-3.95, False, Mouth.LEFT, 0.0),
-        (3.95, False, Mouth.LEFT, np.pi),
-        (-3.95, True, Mouth.LEFT, 0.0),
-        (3.95, True, Mouth.RIGHT, 0.0),
+        (-3.95, False, LEFT, 0.0),
+        (3.95, False, LEFT, np.pi),
+        (-3.95, True, LEFT, 0.0),
+        (3.95, True, RIGHT, 0.0),
     ],
 )
 def test_kerbside_cars_stand_as_traffic_runs(tmp_path, y, oneway, mouth, yaw):
@@ -207,8 +197,7 @@ def test_a_centimetre_and_points_that_lanes_share_are_no_faults(tmp_path):
 @needs_dragon_lake
 def test_dragon_lake_is_a_lot():
     lot = read_lot(DRAGON_LAKE)
-    assert lot.n_slots == 364
-    assert lot.slot_ids[0] == "A-0-0"
+    assert (lot.n_slots, lot.slot_ids[0]) == (364, "A-0-0")
     assert {"A-0-41", "B-1-24", "I-0-20"} < set(lot.slot_ids)
     np.testing.assert_allclose(lot.entries, [[14.38, 76.21]])
     np.testing.assert_allclose(lot.vertex_xy[lot.entry_vertices], lot.entries)
@@ -225,8 +214,7 @@ BAD = json.loads(Path(__file__).with_name("bad_lots.json").read_text(encoding="u
 
 
 def changed(changes):
-    doc = document()
-    features = changes.get("features", {})
+    doc, features = document(), changes.get("features", {})
     if isinstance(features, list):
         return doc | changes
     for number, its in features.items():
@@ -271,8 +259,7 @@ def test_bare_outlines_in_metres_of_their_own_frame_keep_their_numbers(tmp_path,
     lot = import_lot(written(tmp_path, {**doc, "frame": "local"}), options).lot()
     assert sorted(lot.slot_xy[:, 0].round(3)) == [2.5 * i + 1.25 + east for i in range(6)]
     np.testing.assert_allclose(lot.goals, options.goals)
-    with pytest.raises(InputError, match="frame"):
-        import_lot(written(tmp_path, doc), options)
+    assert "frame" in refusal(import_lot, written(tmp_path, doc), options)
 
 
 @pytest.mark.parametrize("name", ["EPSG:25832", "urn:ogc:def:crs:EPSG::25832", "EPSG:2263"])
@@ -298,8 +285,7 @@ def test_positions_in_a_map_grid_are_converted(tmp_path, name):
 )
 def test_positions_of_no_known_kind_are_refused_with_what_to_add(tmp_path, change, head):
     path = written(tmp_path, {**moved(document(), change), **head})
-    with pytest.raises(InputError, match="crs"):
-        read_lot(path)
+    assert "crs" in refusal(read_lot, path)
 
 
 def test_a_position_off_the_globe_among_others_is_named(tmp_path):
@@ -354,8 +340,7 @@ def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
 
 def test_commands_state_parking_costs_and_draw_them(tmp_path):
     costs = np.array([0.0, 0.0, 30.0, 60.0, 90.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    lot = replace(packaged_lot("mini"), slot_parking_cost_s=costs)
-    write_lot(lot, tmp_path / "priced.geojson")
+    write_lot(replace(packaged_lot("mini"), slot_parking_cost_s=costs), tmp_path / "priced.geojson")
     for words in (["check"], ["show", "--out", str(tmp_path / "priced.png")]):
         told = ran("lot", words[0], tmp_path / "priced.geojson", *words[1:])
         assert "parking costs 0 to 90 s (3 slots above 0)" in told.stdout

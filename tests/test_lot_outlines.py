@@ -61,9 +61,7 @@ class TestLayouts:
             ("dead end", [row((0.0, 6.0), 0.0, 9), row((22.5, 0.0), 180.0, 9), row((25.0, 0.0), 90.0, 2)], 1),
         ],
     )
-    def test_every_space_has_a_lane_before_it_and_a_driver_gets_there_and_back(
-        self, tmp_path, name, rows, n_aisles
-    ):
+    def test_every_space_has_a_lane_and_a_driver_gets_there_and_back(self, tmp_path, name, rows, n_aisles):
         draft = imported(tmp_path, rows)
         lot = draft.lot()
         assert lot.n_slots == sum(map(len, rows)), (name, draft.left_out)
@@ -78,14 +76,8 @@ class TestLayouts:
         assert sorted(round(float(np.median(a.points[:, 1])), 1) for a in lot.aisles) == [3.0, 22.9]
 
     def test_an_oblique_row_makes_its_aisle_one_way_by_its_slant(self):
-        lot = inferred(
-            [
-                row((0.0, 4.5), 0.0, 10, angle_deg=60.0),
-                row((29.0, 0.0), 180.0, 10, angle_deg=120.0),
-                row((30.0, 13.9), 180.0, 12),
-                row((0.0, 19.9), 0.0, 12),
-            ]
-        )
+        rows = [row((0.0, 4.5), 0.0, 10, angle_deg=60.0), row((29.0, 0.0), 180.0, 10, angle_deg=120.0)]
+        lot = inferred([*rows, row((30.0, 13.9), 180.0, 12), row((0.0, 19.9), 0.0, 12)])
         assert sorted(abs(aisle.one_way) for aisle in lot.aisles) == [0, 1]
         one_way = [lane for lane in lot.lanes if lane.oneway]
         assert one_way
@@ -115,8 +107,7 @@ class TestRoads:
         aisle = (AISLE | {"oneway": "yes"}, [(30.0, 3.4), (-8.0, 3.4)])
         street = ({"highway": "residential"}, [(-8.0, -20.0), (-8.0, 50.0)])
         back = ({"highway": "service"}, [(30.0, 3.4), (30.0, 30.0), (-8.0, 30.0)])
-        draft = imported(tmp_path, double_row(), more=[aisle, street, back])
-        lot = draft.lot()
+        lot = imported(tmp_path, double_row(), more=[aisle, street, back]).lot()
         one_way = [lane for lane in lot.lanes if lane.oneway]
         assert lot.n_slots == 32
         assert one_way
@@ -150,9 +141,8 @@ class TestGuesses:
     def test_a_given_entry_counts(self, tmp_path):
         free = imported(tmp_path, double_row())
         options = ImportOptions(entries=(tuple(free.entries[0].tolist()),), guess_goal=True)
-        assert not any(
-            guess.startswith("entry") for guess in imported(tmp_path, double_row(), options).guesses
-        )
+        guesses = imported(tmp_path, double_row(), options).guesses
+        assert not any(guess.startswith("entry") for guess in guesses)
 
     @pytest.mark.parametrize(
         "rows", [[row((0.0, 0.0), 0.0, 8)], [row((0.0, y), 0.0, 8) for y in (0.0, 11.0, 22.0)]]
@@ -164,8 +154,7 @@ class TestGuesses:
         assert draft.issues[0].reason == "rows could open to either side"
 
     def test_the_file_keeps_guesses_and_issues(self, tmp_path):
-        draft = imported(tmp_path, double_row())
-        path = tmp_path / "lot.geojson"
+        draft, path = imported(tmp_path, double_row()), tmp_path / "lot.geojson"
         write_lot(draft.lot(), path, Provenance("made.geojson", draft.guesses, draft.issues))
         kept = read_provenance(path)
         assert kept.guesses == draft.guesses
@@ -175,16 +164,13 @@ class TestGuesses:
     def test_damaged_guesses_are_refused(self, tmp_path):
         path = tmp_path / "lot.geojson"
         path.write_text(json.dumps({"import": [1]}), encoding="utf-8")
-        with pytest.raises(InputError, match="import is"):
-            read_provenance(path)
+        assert "import is" in refusal(read_provenance, path)
 
 
 class TestInvariance:
     @settings(max_examples=6, deadline=None)
     @given(turned=st.floats(0.0, 360.0), east=st.floats(-3000.0, 3000.0), north=st.floats(-3000.0, 3000.0))
-    def test_turning_and_moving_the_map_changes_nothing_but_the_frame(
-        self, tmp_path_factory, turned, east, north
-    ):
+    def test_turning_and_moving_the_map_changes_the_frame_alone(self, tmp_path_factory, turned, east, north):
         folder = tmp_path_factory.mktemp("turned")
         rows = [*double_row(6), kerb((25.0, 0.0), 90.0, 3)]
         here = imported(folder, rows).lot()
@@ -199,9 +185,7 @@ class TestInvariance:
 
     def test_the_order_of_spaces_does_not_matter(self, tmp_path):
         made = document(double_row())
-        shuffled = copy.deepcopy(made)
-        order = np.random.default_rng(3).permutation(len(made["features"]))
-        shuffled["features"] = [made["features"][i] for i in order]
+        shuffled = made | {"features": list(np.random.default_rng(3).permutation(made["features"]))}
         lots = [import_lot(write(tmp_path / "made.geojson", d), AUTO).lot() for d in (made, shuffled)]
         one, other = (dict(zip(lot.slot_ids, lot.slot_yaw.round(6).tolist(), strict=True)) for lot in lots)
         assert one == other
@@ -238,10 +222,7 @@ class TestFaults:
             (with_ring(lambda ring: ring.pop()), "way/6: its outline is open"),
             (lambda made: swapped(made["features"][5]), "latitude and longitude swapped"),
             (lambda made: swapped(*made["features"]), "latitude and longitude swapped"),
-            (
-                with_ring(lambda ring: ring.__setitem__(slice(1, 4), [ring[0]] * 3)),
-                "way/6: .*(outline|0.0 m²)",
-            ),
+            (with_ring(lambda r: r.__setitem__(slice(1, 4), [r[0]] * 3)), "way/6: .*(outline|0.0 m²)"),
             (with_ring(six_times_as_large), "way/6: .*m²"),
             (twice, "way/77: lies on way/6"),
         ],
@@ -267,10 +248,7 @@ class TestFaults:
     @pytest.mark.parametrize(
         ("rows", "says"),
         [
-            (
-                [row((0.0, 5.0 * k), 0.0, 16) for k in range(4)],
-                "32 of 64 spaces have no aisle: .* another space",
-            ),
+            ([row((0, 5 * k), 0, 16) for k in range(4)], "32 of 64 spaces have no aisle: .* another space"),
             ([row((0.0, 0.0), 0.0, 8, size=(16.0, 3.5))], "for cars: spaces larger than 30 m²"),
         ],
         ids=["landlocked", "lorries"],
@@ -287,8 +265,7 @@ class TestExtracts:
             del each["id"]
         path = write(tmp_path / "plain.geojson", made)
         lot = import_lot(path, AUTO).lot()
-        assert lot.n_slots == 32
-        assert lot.slot_ids[0] == "feature/0"
+        assert (lot.n_slots, lot.slot_ids[0]) == (32, "feature/0")
         with pytest.raises(InputError, match=r"`parkenv lot import .* makes a lot of it"):
             read_lot(path)
 
@@ -302,8 +279,7 @@ class TestSurvey:
     @pytest.mark.parametrize("name", ["mini", "campus", "street"])
     def test_packaged_lots_are_clean(self, name):
         survey = check_drivability(packaged_lot(name))
-        assert survey.problems == ()
-        assert survey.error_probability == 0.0
+        assert (survey.problems, survey.error_probability) == ((), 0.0)
 
     def test_one_way_lanes_without_a_loop(self):
         mini = packaged_lot("mini")
@@ -313,8 +289,7 @@ class TestSurvey:
     def test_a_lane_over_a_slot(self):
         mini = packaged_lot("mini")
         over = Lane(np.array([mini.lanes[0].points[1], mini.slot_xy[0]]))
-        lot = ParkingLot(**{**features(mini), "lanes": (*mini.lanes, over)})
-        survey = check_drivability(lot)
+        survey = check_drivability(ParkingLot(**{**features(mini), "lanes": (*mini.lanes, over)}))
         assert any("leaves less than 1 m to the slot" in p.message for p in survey.problems)
         assert survey.error_probability >= 0.5
 
@@ -346,10 +321,7 @@ class TestTown:
 
     @pytest.mark.parametrize(
         ("words", "says"),
-        [
-            ("--entry 0,0", "--split finds entries"),
-            ("--least 50", "in groups of at most 24, want a group of 50"),
-        ],
+        [("--entry 0,0", "--split finds entries"), ("--least 50", "of at most 24, want a group of 50")],
     )
     def test_what_cannot_be_split_is_refused(self, tmp_path, words, says):
         path = write(tmp_path / "town.geojson", self.town())
