@@ -112,8 +112,7 @@ def test_noise_follows_the_seed_geometry_does_not_and_truth_travels(scene):
 
 
 def test_same_bytes_on_any_number_of_threads(scene):
-    weather = Weather.draw("rain", 1)
-    before = numba.get_num_threads()
+    weather, before = Weather.draw("rain", 1), numba.get_num_threads()
     try:
         frames = []
         for threads in sorted({1, before}):
@@ -171,10 +170,8 @@ def test_shadows_changed_in_place_are_those_drawn_anew(preset):
 
 
 def test_boxes_of_vehicles(row):
-    pose = camera_pose(0.0, 0.0, 1.4, -math.pi / 2)
-    camera = PinholeCamera()
-    frame = camera.render(row, pose)
-    boxes = vehicle_boxes(camera, row, pose, frame)
+    pose, camera = camera_pose(0.0, 0.0, 1.4, -math.pi / 2), PinholeCamera()
+    boxes = vehicle_boxes(camera, row, pose, camera.render(row, pose))
     # Body and pane are two instances of one vehicle here.
     middle = boxes.ids == 3
     assert middle.any()
@@ -310,12 +307,10 @@ def test_glass_is_found_apart_from_what_is_behind():
     pane = box_mesh(0.01, 2.0, 2.0, Material.GLASS)
     wall = box_mesh(0.5, 9.0, 9.0, Material.STONE)
     scene = toy_scene([pane, wall], [(0, 3.0, 0.0, 0.2, 0.0), (1, 6.25, 0.0, 0.0, 0.0)], [1, 0])
-    camera = plain_camera()
-    _, seen = camera.visibility(scene, camera_pose(0.0, 0.0, 1.2, 0.0))
+    _, seen = plain_camera().visibility(scene, camera_pose(0.0, 0.0, 1.2, 0.0))
     assert 1.0 / seen.inverse_depth[60, 80] == pytest.approx(6.0, abs=1e-4)
     assert 1.0 / seen.pane_inverse_depth[60, 80] == pytest.approx(2.995, abs=1e-4)
-    assert seen.n_panes[60, 80] == 2
-    assert seen.pane[60, 0] == -1
+    assert (seen.n_panes[60, 80], seen.pane[60, 0]) == (2, -1)
 
 
 def test_skipping_what_is_hidden_changes_nothing():

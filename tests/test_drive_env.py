@@ -11,6 +11,7 @@ import shapely
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lot_checks import refusal
 
 from parkenv import InputError, Traffic
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
@@ -25,6 +26,8 @@ from sim_sensors.laser.scanner import LaserScanner
 ID = "parkenv/Drive-v1"
 LOTS = ("campus", "jam", "street", "mini")
 CAR = VehicleParameters()
+STILL = np.zeros(2, dtype=np.float32)
+CROWD = Traffic(cars=6, pedestrians=8)
 
 
 def make(lot="campus", **arguments):
@@ -32,8 +35,7 @@ def make(lot="campus", **arguments):
 
 
 def random_drive(env, seed, steps=60):
-    rng = np.random.default_rng(seed)
-    seen = [env.reset(seed=seed)]
+    rng, seen = np.random.default_rng(seed), [env.reset(seed=seed)]
     for _ in range(steps):
         seen.append(env.step(rng.uniform(-1.0, 1.0, 2).astype(np.float32)))
         if seen[-1][2] or seen[-1][3]:
@@ -54,10 +56,6 @@ def placed_at(env, x, y, yaw, speed=0.0):
 @lru_cache
 def tasks_on(lot):
     return ParkingTasks(packaged_lot(lot))
-
-
-STILL = np.zeros(2, dtype=np.float32)
-CROWD = Traffic(cars=6, pedestrians=8)
 
 
 @pytest.mark.parametrize("lot", ["campus", "street"])
@@ -201,15 +199,13 @@ def test_tasks_are_what_they_say(seed, lot):
     i = tasks.lot.slot_ids.index(task.slot_id)
     assert task.size == (tasks.lot.slot_length[i], tasks.lot.slot_width[i])
     assert (task.room > 0.0).all()
-    away = task.in_slot_frame(task.vehicle.at_middle(task.start[:3])[:2])
-    assert 1.0 < np.hypot(*away) < 22.0
+    assert 1.0 < np.hypot(*task.in_slot_frame(task.vehicle.at_middle(task.start[:3])[:2])) < 22.0
 
 
 def test_each_kind_and_way_is_drawn():
     drawn = list(map(tasks_on("campus").draw, range(40)))
-    assert {(t.kind, t.way) for t in drawn} == {
-        (kind, way) for kind in ("perpendicular", "oblique") for way in ("nose-in", "back-in")
-    }
+    kinds, ways = ("perpendicular", "oblique"), ("nose-in", "back-in")
+    assert {(t.kind, t.way) for t in drawn} == {(kind, way) for kind in kinds for way in ways}
     assert {tasks_on("street").draw(k).kind for k in range(5)} == {"parallel"}
 
 
@@ -229,9 +225,8 @@ def test_slack_clears_the_slots_beside_and_distance_moves_the_start():
 
     def start_away(distance, starts):
         tasks = ParkingTasks(campus, distance=distance, starts=starts, slack=3.0)
-        return np.mean(
-            [np.hypot(*(t.vehicle.at_middle(t.start[:3]) - t.slot)[:2]) for t in map(tasks.draw, range(30))]
-        )
+        drawn = list(map(tasks.draw, range(30)))
+        return np.mean([math.dist(t.vehicle.at_middle(t.start[:3])[:2], t.slot[:2]) for t in drawn])
 
     assert start_away((2.0, 4.0), "lane") < start_away((12.0, 14.0), "lane") - 4.0
     assert start_away((0.2, 0.5), "way-out") < 0.6
@@ -298,11 +293,9 @@ def test_actions_and_starts_that_are_none_are_refused():
     env = make("mini").unwrapped
     env.reset(seed=0)
     for action in ([math.nan, 0.0], [0.0, math.inf], [0.0], [0.0, 0.0, 0.0], 3.0, "left", None):
-        with pytest.raises(InputError, match="action is"):
-            env.step(action)
+        assert "action is" in refusal(env.step, action)
     for start in ([0.0, math.nan, 0.0], [0.0, 0.0], "here", [1000.0, 0.0, 0.0]):
-        with pytest.raises(InputError, match="start "):
-            env.reset(seed=0, options={"start": start})
+        assert "start " in refusal(env.reset, seed=0, options={"start": start})
 
 
 def test_a_start_in_collision_is_refused_and_a_free_one_is_taken():
@@ -329,10 +322,8 @@ def test_a_lot_file_is_driven_in_if_it_says_how_wide_its_slots_are(tmp_path):
     whole = dict(slot["properties"])
     del slot["properties"]["width"]
     path.write_text(json.dumps(document))
-    with pytest.raises(InputError, match="width is missing"):
-        make(path)
+    assert "width is missing" in refusal(make, path)
     slot["properties"] = whole
     slot["geometry"] = {"type": "Point", "coordinates": [1.0, 1.0]}
     path.write_text(json.dumps(document))
-    with pytest.raises(InputError, match="slot: geometry is 'Point', want Polygon"):
-        make(path)
+    assert "slot: geometry is 'Point', want Polygon" in refusal(make, path)

@@ -77,14 +77,12 @@ def compare(scanner, plane, pose):
     scanner=st.sampled_from([LASER, WIDE, LaserScanner(n_beams=1), LaserScanner(n_beams=37, step=0.1)]),
 )
 def test_scans_are_what_the_definition_says(seed, n, n_walls, extent, yaw, scanner):
-    plane = random_plane(np.random.default_rng(seed), n, n_walls, extent)
-    compare(scanner, plane, (0.0, 0.0, yaw))
+    compare(scanner, random_plane(np.random.default_rng(seed), n, n_walls, extent), (0.0, 0.0, yaw))
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (413_000.25, 5_320_000.5)])
 def test_few_beams_are_at_edges_in_a_large_sample_near_the_origin_and_far_from_it(shift):
-    rng = np.random.default_rng(1)
-    edges = 0
+    rng, edges = np.random.default_rng(1), 0
     for _ in range(5):
         plane = random_plane(rng, int(rng.integers(20, 300)), int(rng.integers(0, 20)), 60.0)
         corners, n_corners = plane.footprints
@@ -120,8 +118,7 @@ def test_faces_end_on_close_by_behind_or_not_there_are_as_by_definition():
 
 def test_no_beam_slips_through_the_joints_of_a_closed_room():
     outline = regular_polygon(900, radius=9.0)
-    walls = np.stack([outline, np.roll(outline, -1, 0)], 1)
-    plane = ScanPlane(np.empty((0, 4, 2)), walls=walls)
+    plane = ScanPlane(np.empty((0, 4, 2)), walls=np.stack([outline, np.roll(outline, -1, 0)], 1))
     poses = np.random.default_rng(0).uniform((-6, -6, -4), (6, 6, 4), (200, 3))
     assert np.isfinite(LASER.scan(plane, poses)).all()
 
@@ -147,8 +144,7 @@ def test_changing_one_footprint_is_as_building_anew():
     plane = random_plane(rng, 150, 5, 60.0)
     corners, n_corners = plane.footprints
     for step in range(200):
-        i = int(rng.integers(150))
-        k = int(rng.choice([0, 3, 4, 8, 12]))
+        i, k = int(rng.integers(150)), int(rng.choice([0, 3, 4, 8, 12]))
         new = regular_polygon(k, *rng.uniform(-70, 70, 2), rng.choice([1.0, 2.0, 12.0]))
         corners[i] = 0
         corners[i, :k], n_corners[i] = new, k
@@ -175,10 +171,8 @@ def test_orientation_and_corners_on_a_straight_edge_do_not_matter():
 def test_noise_has_the_spread_and_the_losses_that_were_asked_for():
     plane = ScanPlane(np.empty((0, 4, 2)), walls=[[[5, -90], [5, 90]]])
     scanner = LaserScanner(n_beams=201, start=-0.5, step=0.005, noise_sd=0.03, dropout=0.1)
-    poses = np.zeros((2000, 3))
-    noisy = scanner.scan(plane, poses, np.random.default_rng(0)).astype(float)
-    error = noisy - scanner.scan(plane, (0, 0, 0))
-    kept = np.isfinite(noisy)
+    noisy = scanner.scan(plane, np.zeros((2000, 3)), np.random.default_rng(0)).astype(float)
+    error, kept = noisy - scanner.scan(plane, (0, 0, 0)), np.isfinite(noisy)
     assert 1 - kept.mean() == pytest.approx(0.1, abs=2e-3)
     assert error[kept].mean() == pytest.approx(0, abs=3e-4)
     assert error[kept].std() == pytest.approx(0.03, rel=0.01)
@@ -192,8 +186,7 @@ def test_noise_has_the_spread_and_the_losses_that_were_asked_for():
     plane = ScanPlane([SQUARE], walls=[[[-29.9, -90], [-29.9, 90]]])
     noisy = replace(WIDE, noise_sd=5.0, dropout=0.0).scan(plane, np.zeros((50, 3)), np.random.default_rng(0))
     finite = noisy[np.isfinite(noisy)]
-    assert finite.min() == 0.0
-    assert finite.max() == 30.0
+    assert (finite.min(), finite.max()) == (0.0, 30.0)
     assert np.isinf(replace(LASER, dropout=1.0).scan(plane, (0, 0, 0), np.random.default_rng(0))).all()
 
 

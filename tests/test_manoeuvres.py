@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -39,10 +40,7 @@ PUBLIC = Path(__file__).parents[2] / "shared" / "data" / "manoeuvres"
 # A parallel slot along x below a lane, between two blocks: 0.5 m longer than TPCAP's car.
 GAP = TPCAP.length + 0.5
 START, TARGET = (1.0, 3.0, 0.0), (TPCAP.rear_overhang + 0.25, 0.0, 0.0)
-BLOCKS = [
-    [[-6.0, -1.2], [0.0, -1.2], [0.0, 1.1], [-6.0, 1.1]],
-    [[GAP, -1.2], [GAP + 6.0, -1.2], [GAP + 6.0, 1.1], [GAP, 1.1]],
-]
+BLOCKS = [[[x, -1.2], [x + 6.0, -1.2], [x + 6.0, 1.1], [x, 1.1]] for x in (-6.0, GAP)]
 KERB = [[-6.0, -1.3], [GAP + 6.0, -1.3]]
 
 
@@ -79,9 +77,8 @@ def test_every_format_says_the_same_scene_wherever_it_lies(tmp_path):
     assert [scene.name for scene in scenes] == ["a1", "a2", "a3", "a10"]
     for scene in scenes:
         assert scene.vehicle == TPCAP
-        np.testing.assert_allclose(
-            scene.start[:2] + scene.origin - (far if scene.name == "a2" else 0.0), START[:2], atol=1e-6
-        )
+        away = far if scene.name == "a2" else 0.0
+        np.testing.assert_allclose(scene.start[:2] + scene.origin - away, START[:2], atol=1e-6)
         np.testing.assert_allclose(scene.target - scene.start, np.subtract(TARGET, START), atol=1e-6)
         assert len(scene.contours) == (2 if scene.name in ("a1", "a2") else 3)
         away = shapely.Polygon(TPCAP.corners(scene.target)).distance(shapely.union_all(scene.shapes))
@@ -92,10 +89,8 @@ def test_every_format_says_the_same_scene_wherever_it_lies(tmp_path):
 def test_parkbench_is_read_in_the_frame_of_its_obstacles_without_what_lies_below_the_target(tmp_path):
     stop = [[-0.8, -1.5], [-0.8, 1.5]]  # across the parked car, and beyond its sides
     wall = [[8.0, -3.0], [8.0, 3.0]]
-    file, content = (
-        tmp_path / "scene.json",
-        parkbench_content([stop, wall], (5.0, 1.0), (4.0, 1.0), (-1.0, 0.0, 0.0)),
-    )
+    content = parkbench_content([stop, wall], (5.0, 1.0), (4.0, 1.0), (-1.0, 0.0, 0.0))
+    file = tmp_path / "scene.json"
     file.write_text(json.dumps(content))
     scene = read_scene(file)
     assert scene.vehicle == TPCAP
@@ -128,8 +123,7 @@ def test_footprints_between_two_poses_lie_on_the_arc_between_them(yaw, curvature
 
 def test_the_tightest_slot_is_left_and_entered_within_all_limits(tmp_path):
     (tmp_path / "slot.toml").write_text(own_text())
-    scene = read_scene(tmp_path / "slot.toml")
-    made = park(scene)
+    made = park(read_scene(tmp_path / "slot.toml"))
     assert made.judged.driven, made.judged
     assert made.judged.clearance_m > 0.001
     require_limits(made.states)
@@ -259,8 +253,7 @@ LOW, HIGH = np.array([-20.0, -20.0]), np.array([20.0, 20.0])
 
 
 def planned(task, settings=None):
-    things = task.obstacles
-    target = task.vehicle.at_rear_axle(task.target)
+    things, target = task.obstacles, task.vehicle.at_rear_axle(task.target)
     return plan_path(task.vehicle, things.corners, things.n_corners, task.start[:3], target, settings)
 
 
@@ -290,8 +283,7 @@ def test_the_planners_check_and_pymunk_agree_on_what_is_touched(seed, k):
 
 
 def test_room_is_the_distance_to_what_is_nearest():
-    wall = np.array([[[5.0, -9.0], [5.0, 9.0]]])
-    space = clearance(CAR, wall, np.array([2]), LOW, HIGH)
+    space = clearance(CAR, np.array([[[5.0, -9.0], [5.0, 9.0]]]), np.array([2]), LOW, HIGH)
     ahead = CAR.length - CAR.rear_overhang
     assert room_at(space, 5.0 - ahead - 0.3, 0.0, 0.0, 1.0) == pytest.approx(0.3, abs=1e-3)
     assert room_at(space, 5.0 - 0.5 * CAR.width - 0.2, 0.0, math.pi / 2, 1.0) == pytest.approx(0.2, abs=1e-3)
@@ -345,8 +337,7 @@ def test_a_path_is_followed_to_the_centimetre_forward_and_in_reverse(lengths, be
     """Off the path by a decimetre at first, the car comes back to it, and stops where the path ends."""
     path = CarPath(np.zeros(3), np.array(lengths), np.array(bends[: len(lengths)]))
     tracker = PathTracker(CAR, path)
-    state = np.array([0.0, 0.06, 0.0, 0.0, 0.0, 0.0])
-    offsets = []
+    state, offsets = np.array([0.0, 0.06, 0.0, 0.0, 0.0, 0.0]), []
     for _ in range(400):
         pedal, turn = tracker.command(state[:3], state[SPEED], state[STEERING])
         if tracker.done:
@@ -398,8 +389,7 @@ def test_the_planner_waits_for_those_who_move():
 
 
 def test_an_observation_without_the_map_is_refused():
-    env = gym.make("parkenv/Drive-v1", lot="mini")
-    observation, _ = env.reset(seed=0)
+    observation, _ = gym.make("parkenv/Drive-v1", lot="mini").reset(seed=0)
     with pytest.raises(InputError, match="no 'cars': make the environment with obstacle_map=True"):
         ParkingAgent().predict(observation)
 
@@ -442,10 +432,8 @@ def test_a_pose_without_room_is_named(blocked, where):
 
 
 def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "parkenv.studies.trips.parking_runs.ParkingAgent",
-        lambda vehicle: ParkingAgent(vehicle, search=NO_ROOM),
-    )
+    no_room = partial(ParkingAgent, search=NO_ROOM)
+    monkeypatch.setattr("parkenv.studies.trips.parking_runs.ParkingAgent", no_room)
     out = tmp_path / "park"
     done = ran("park --seed 3 --lot mini --way back-in --episodes 2 --jobs 1 --out", out)
     assert "failed: mini, seed 3" in done.stdout

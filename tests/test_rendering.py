@@ -108,8 +108,7 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
     env.reset(seed=0)
     nothing, frames = np.zeros(4000, dtype=bool), {}
     for vertex in (0, 2000, 3999, 0):
-        state = stand_in(env, vertex=vertex, path=[vertex])
-        frame = renderer.frame(state, nothing)
+        frame = renderer.frame(stand_in(env, vertex=vertex, path=[vertex]), nothing)
         still = renderer.frames.still(scenario.lot.vertex_xy[vertex])
         column, row = still.view(scenario.lot.vertex_xy[vertex])
         assert 0.2 * 640 < column < 0.8 * 640
@@ -123,8 +122,7 @@ def test_the_end_of_a_search_shows_the_walk():
     env = start(row_lot())
     unwrapped = env.unwrapped
     while unwrapped.state.vertex >= 10:
-        out = unwrapped.scenario.lot.neighbors[unwrapped.state.vertex]
-        env.step(int(np.argmax(out >= 0)))
+        env.step(int(np.argmax(unwrapped.scenario.lot.neighbors[unwrapped.state.vertex] >= 0)))
     before = env.render()
     free = not unwrapped.state.world.occupied(np.array([unwrapped.state.vertex]), unwrapped.state.time)[0]
     env.step(PARK)
@@ -140,8 +138,7 @@ def test_the_end_of_a_search_shows_the_walk():
 def test_a_full_lot_ends_at_a_junction_too():
     lot = row_lot()
     full = OccupancyProcess(np.full(10, 100.0), np.full(168, 9.0), np.ones(10), np.full(168, 1e-9))
-    env = start(lot, occupancy=full)
-    over = False
+    env, over = start(lot, occupancy=full), False
     while not over:
         out = np.flatnonzero(env.unwrapped.action_masks()[:PARK])
         onward = lot.vertex_xy[lot.neighbors[env.unwrapped.state.vertex, out], 0]
@@ -172,8 +169,7 @@ def test_a_window_shows_frames_and_without_pygame_says_what_to_install(monkeypat
     import pygame
 
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    window = Window("a title")
-    frame = np.zeros((480, 640, 3), dtype=np.uint8)
+    window, frame = Window("a title"), np.zeros((480, 640, 3), dtype=np.uint8)
     frame[100, 200] = 1, 2, 3
     window.show(frame, 1000)
     assert pygame.display.get_surface().get_at((200, 100))[:3] == (1, 2, 3)
@@ -196,8 +192,7 @@ def test_obstacles_stand_out_of_a_drive_more_than_anything_painted_on_the_ground
 
     env = gym.make("parkenv/Drive-v1", lot=lot, render_mode="rgb_array")
     env.reset(seed=3)
-    frame = env.render()[:440]
-    contrast = {}
+    frame, contrast = env.render()[:440], {}
     for name in ("floor", "parked", "paint"):
         assert (frame == PALETTE[name]).all(axis=2).mean() > 0.003, name
         low, high = sorted((luminance(name), luminance("floor")))
@@ -210,7 +205,7 @@ def polygons(paved):
 
 
 @pytest.mark.parametrize("name", ["campus", "street", "mini"])
-def test_asphalt_is_where_cars_drive_and_park(name):
+def test_asphalt_is_where_cars_drive_and_park_marks_lie_on_their_lanes_and_entries_lead_in(name):
     lot = packaged_lot(name)
     outline = LotScene.of(lot)
     kerbed, asphalt = polygons(outline.paved(apron=0.0)), polygons(outline.paved())
@@ -219,12 +214,6 @@ def test_asphalt_is_where_cars_drive_and_park(name):
     assert all(asphalt.contains(shapely.Polygon(corners)) for corners in outline.slots)
     assert shapely.contains(asphalt, shapely.points(lot.vertex_xy[: lot.n_slots])).all()
     assert not any(asphalt.contains(shapely.Point(wall[0])) for wall in outline.walls)
-
-
-@pytest.mark.parametrize("name", ["campus", "street", "mini"])
-def test_marks_lie_on_their_lanes_and_entries_lead_in(name):
-    lot = packaged_lot(name)
-    outline = LotScene.of(lot)
     one_way = shapely.union_all([shapely.LineString(lane.points) for lane in lot.lanes if lane.oneway])
     assert len(outline.centre_lines) + sum(lane.oneway for lane in lot.lanes) == len(lot.lanes)
     for x, y, yaw in outline.arrows:
@@ -232,7 +221,6 @@ def test_marks_lie_on_their_lanes_and_entries_lead_in(name):
         assert one_way.distance(shapely.Point(x, y)) < 1e-6
         assert one_way.distance(ahead) < 1e-6
     np.testing.assert_array_equal(outline.entries[:, :2], lot.entries)
-    asphalt = polygons(outline.paved())
     x, y, yaw = outline.entries.T
     assert shapely.contains_xy(asphalt, x + 3.0 * np.cos(yaw), y + 3.0 * np.sin(yaw)).all()
 
@@ -350,7 +338,6 @@ def test_every_environment_is_filmed(name, tmp_path):
             break
     env.close()
     (film,) = (tmp_path / "films").glob("*.mp4")
-    frames = cv2.VideoCapture(str(film))
-    there, frame = frames.read()
+    there, frame = cv2.VideoCapture(str(film)).read()
     assert there
     assert frame.std() > 5.0

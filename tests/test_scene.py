@@ -20,19 +20,12 @@ from parkenv.errors import InputError
 from planners.driving import manoeuvre
 from planners.driving.manoeuvre import Manoeuvre, drive, park, paths_in_scene
 from planners.driving.path_tracking import TrackingSettings
+from sim_sensors import scenery
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.mesh import Material
 from sim_sensors.scene import Scene
-from sim_sensors.scenery import (
-    building_mesh,
-    hedge_mesh,
-    pedestrian_footprint,
-    pedestrian_mesh,
-    tree_mesh,
-    wall_mesh,
-)
 from sim_sensors.slot_scenes import SlotLot, slot_surroundings
 from sim_sensors.surroundings import HEDGE_THICKNESS_M, Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
@@ -55,13 +48,9 @@ def lot(n=20, **options):
 
 
 def test_a_scene_holds_what_it_was_given():
-    scene = Scene.from_arrays(
-        [[0, 0, 0], [4, 0, 1.5], [9, 0, 0]],
-        [1, 2, 1],
-        ["suv", None, "suv"],
-        [(200, 0, 0), None, None],
-        Surroundings(**AROUND, paved=[[[0, 0], [9, 0], [9, 9]]], markings=[[0, 0, 0, 5, 0.1]]),
-    )
+    poses, bodies = [[0, 0, 0], [4, 0, 1.5], [9, 0, 0]], ["suv", None, "suv"]
+    around = Surroundings(**AROUND, paved=[[[0, 0], [9, 0], [9, 9]]], markings=[[0, 0, 0, 5, 0.1]])
+    scene = Scene.from_arrays(poses, [1, 2, 1], bodies, [(200, 0, 0), None, None], around)
     first, third = (scene.fleet.models[scene.vehicle_model[i]] for i in (0, 2))
     assert first.paint == (200, 0, 0)
     assert first.painted(third.paint) == third == VehicleModel.from_seed("suv", 1)
@@ -70,8 +59,7 @@ def test_a_scene_holds_what_it_was_given():
     assert ids[-3:].tolist() == [1, 2, 3]
     assert not ids[:-3].any()
     assert len(ids) == 3 + 1 + 2 + 2 + 1
-    assert scene.ground.markings.shape == (1, 5)
-    assert len(scene.ground.paved) == 1
+    assert (scene.ground.markings.shape, len(scene.ground.paved)) == ((1, 5), 1)
 
 
 def test_the_pool_holds_every_mesh_and_its_coarse_one():
@@ -110,15 +98,13 @@ def test_footprints_are_where_the_vehicles_stand():
     np.testing.assert_array_equal(prints.corners[0, : prints.n_corners[0]], scene.footprint(0))
     # The low wall is passed over, the high one is met on four sides, the building on four.
     assert len(prints.walls) == 4 + 4
-    plane = ScanPlane(prints.corners, prints.n_corners, prints.walls, prints.ids)
-    assert plane.n_footprints == 5
+    assert ScanPlane(prints.corners, prints.n_corners, prints.walls, prints.ids).n_footprints == 5
 
 
 def test_hedges_are_drawn_and_met_by_the_laser():
     around = Surroundings(hedges=[[2, -3, 2, 3, 1.2], [-4, -3, -4, 3, 0.4]])
     assert len(around.standing) == 2
-    scene = Scene.from_arrays(np.empty((0, 3)), [], surroundings=around)
-    walls = scene.footprints().walls
+    walls = Scene.from_arrays(np.empty((0, 3)), [], surroundings=around).footprints().walls
     assert len(walls) == 4  # the low one is passed over
     assert walls[..., 0].min() == pytest.approx(2 - HEDGE_THICKNESS_M / 2)
     mesh = around.standing[0].mesh
@@ -132,8 +118,7 @@ def test_changing_one_slot_leaves_every_other_array_as_it_was():
     scene = parking.scene(np.ones(40, bool))
     pool, before, prints = scene.pool, scene.instances, scene.footprints()
     gone = scene.without_vehicle(7)
-    back = parking.filled(gone, 7, 0)
-    other = parking.filled(gone, 7, 1)
+    back, other = parking.filled(gone, 7, 0), parking.filled(gone, 7, 1)
     for changed in (gone, back, other):
         assert changed.pool is pool
         assert changed.ground is scene.ground
@@ -143,8 +128,7 @@ def test_changing_one_slot_leaves_every_other_array_as_it_was():
             np.testing.assert_array_equal(getattr(changed.instances, name)[keep], getattr(before, name)[kept])
         rest = np.arange(len(prints.ids)) != 7
         np.testing.assert_array_equal(changed.footprints().corners[rest], prints.corners[rest])
-    assert gone.footprints().n_corners[7] == 0
-    assert gone.footprint(7).shape == (0, 2)
+    assert (gone.footprints().n_corners[7], gone.footprint(7).shape) == (0, (0, 2))
     np.testing.assert_array_equal(back.instances.pose, before.pose)
     assert not np.array_equal(other.vehicle_pose[7], scene.vehicle_pose[7])
     assert scene.vehicle_model[7] >= 0
@@ -173,8 +157,7 @@ def test_the_scan_plane_of_a_changed_scene_is_that_of_one_made_anew():
 
 
 def test_the_car_in_a_slot_depends_on_seed_slot_and_arrival_alone():
-    parking = lot(seed=5)
-    rng = np.random.default_rng(0)
+    parking, rng = lot(seed=5), np.random.default_rng(0)
     full = parking.scene(np.ones(40, bool))
     occupied = rng.random(40) < 0.5
     some = parking.scene(occupied)
@@ -189,14 +172,12 @@ def test_the_car_in_a_slot_depends_on_seed_slot_and_arrival_alone():
 def test_a_model_that_the_fleet_lacks_is_added_behind_the_others():
     scene = Scene.from_arrays([[0, 0, 0], [9, 0, 0]], [1, 2])
     pool = scene.pool
-    new = VehicleModel.from_seed("pickup", 77)
-    changed = scene.with_vehicle(1, model=new, pose=(12, 3, 1.0))
+    changed = scene.with_vehicle(1, model=VehicleModel.from_seed("pickup", 77), pose=(12, 3, 1.0))
     assert changed.fleet.models[:2] == scene.fleet.models
     assert changed.vehicle_pose[1].tolist() == [12, 3, 1]
     np.testing.assert_array_equal(changed.pool.vertices[: len(pool.vertices)], pool.vertices)
-    whole = Scene(
-        changed.vehicle_pose, changed.vehicle_model, type(scene.fleet)(changed.fleet.models, Surroundings())
-    )
+    fleet = type(scene.fleet)(changed.fleet.models, Surroundings())
+    whole = Scene(changed.vehicle_pose, changed.vehicle_model, fleet)
     for name in ("vertices", "triangles", "color", "vertex_start", "triangle_start", "radius", "coarse"):
         np.testing.assert_array_equal(getattr(changed.pool, name), getattr(whole.pool, name))
 
@@ -211,8 +192,7 @@ def test_cars_fit_do_not_overlap_and_park_as_the_manners_say_one_way_at_kerbs():
         assert boxes[:, 0].max() <= length + 0.2
         assert boxes[:, 1].max() <= width - 0.4
     xy = 50.0 * np.column_stack([np.arange(1500), np.zeros(1500)])
-    parking = SlotLot(xy, np.zeros(1500), 6.5, 3.4, seed=2)
-    scene = parking.scene(np.ones(1500, bool))
+    scene = SlotLot(xy, np.zeros(1500), 6.5, 3.4, seed=2).scene(np.ones(1500, bool))
     offset = scene.vehicle_pose[:, :2] - xy
     turn = np.mod(scene.vehicle_pose[:, 2] + np.pi / 2, np.pi) - np.pi / 2
     assert offset.std(axis=0) == pytest.approx([0.20, 0.12], rel=0.1)
@@ -232,20 +212,19 @@ def test_the_lanes_of_a_lot_are_paved():
     scene = dataclasses.replace(lot, surroundings=around).scene(occupied)
     assert scene.present.tolist() == np.flatnonzero(occupied).tolist()
     assert len(scene.ground.markings) == 10  # five lines a row: a shared line is painted once
-    paved = Polygon(scene.ground.paved[0])
-    assert paved.contains(LineString([[-5, 5.5], [30, 5.5]]))
+    assert Polygon(scene.ground.paved[0]).contains(LineString([[-5, 5.5], [30, 5.5]]))
     assert len(scene.footprints().walls) == 8
 
 
 @pytest.mark.parametrize(
     "mesh",
     [
-        building_mesh([[0, 0], [20, 0], [20, 12], [10, 12], [10, 8], [0, 8]], 9.0, 1),
-        wall_mesh([0, 0], [5, 1], 2.0, 0.24, 1),
-        hedge_mesh([0, 0], [5, 1], 1.2, 0.8, 1),
-        tree_mesh(7.0, 3),
-        pedestrian_mesh(0.0, 1),
-        pedestrian_mesh(0.25, 2),
+        scenery.building_mesh([[0, 0], [20, 0], [20, 12], [10, 12], [10, 8], [0, 8]], 9.0, 1),
+        scenery.wall_mesh([0, 0], [5, 1], 2.0, 0.24, 1),
+        scenery.hedge_mesh([0, 0], [5, 1], 1.2, 0.8, 1),
+        scenery.tree_mesh(7.0, 3),
+        scenery.pedestrian_mesh(0.0, 1),
+        scenery.pedestrian_mesh(0.25, 2),
     ],
     ids=["building", "wall", "hedge", "tree", "striding", "passing"],
 )
@@ -260,9 +239,9 @@ def test_scenery_is_turned_the_right_way_round(mesh):
 
 def test_people_have_their_legs_inside_their_footprint():
     for phase in (0.0, 0.25, 0.6):
-        mesh = pedestrian_mesh(phase, 4)
+        mesh = scenery.pedestrian_mesh(phase, 4)
         knee = mesh.vertices[(mesh.vertices[:, 2] > 0.45) & (mesh.vertices[:, 2] < 0.55), :2]
-        shape = Polygon(pedestrian_footprint(phase)).buffer(0.03)
+        shape = Polygon(scenery.pedestrian_footprint(phase)).buffer(0.03)
         assert all(shape.contains(LineString([p, p + 1e-6])) for p in knee)
 
 

@@ -49,8 +49,7 @@ def drive(env, seed, actions):
 
 def test_captures_drawn_side_by_side_are_those_drawn_one_by_one():
     options = {"scenario": "campus", "traffic": BUSY, "captures": 4}
-    together = drive(make(**options), 3, (0, 3, 1))
-    cores = numba.get_num_threads()
+    together, cores = drive(make(**options), 3, (0, 3, 1)), numba.get_num_threads()
     numba.set_num_threads(1)
     try:
         alone = drive(make(**options), 3, (0, 3, 1))
@@ -81,12 +80,10 @@ def test_the_search_is_that_of_the_search_environment():
 def test_captures_lie_on_the_edge_just_driven_end_at_the_stop_and_waiting_makes_one():
     env = make(scenario="campus", rig=LASER_ONLY, captures=4, every=1.0)
     env.reset(seed=0)
-    lot = env.unwrapped.scenario.lot
-    before = env.unwrapped.state.vertex
+    lot, before = env.unwrapped.scenario.lot, env.unwrapped.state.vertex
     counts = set()
     for _ in range(12):
-        action = int(np.flatnonzero(lot.neighbors[before] >= 0)[-1])
-        observation, *_ = env.step(action)
+        observation, *_ = env.step(int(np.flatnonzero(lot.neighbors[before] >= 0)[-1]))
         here, n = int(observation["vertex"]), int(observation["count"])
         start, end = lot.vertex_xy[before], lot.vertex_xy[here]
         shares = np.arange(1, n + 1) / n
@@ -105,8 +102,7 @@ def test_captures_lie_on_the_edge_just_driven_end_at_the_stop_and_waiting_makes_
     # Waiting makes one capture, and time goes on.
     env = make(rig=LASER_ONLY)
     start, _ = env.reset(seed=0)
-    missing = int(np.flatnonzero(start["action_mask"] == 0)[0])
-    observation, *_ = env.step(missing)
+    observation, *_ = env.step(int(np.flatnonzero(start["action_mask"] == 0)[0]))
     assert start["count"] == observation["count"] == 1
     np.testing.assert_array_equal(observation["pose"][0], start["pose"][0])
     assert observation["captured_at"][0] == 1.0
@@ -121,8 +117,7 @@ def test_scans_alone_are_those_beside_the_pictures():
 
 
 def test_pictures_of_another_width():
-    env = make(picture_width=160)
-    assert env.reset(seed=1)[0]["image_right"].shape[1:] == (120, 160, 3)
+    assert make(picture_width=160).reset(seed=1)[0]["image_right"].shape[1:] == (120, 160, 3)
     assert make().unwrapped.rig is SMALL_RIG
     for wanted, width in ((None, PICTURE_WIDTH), (640, 640)):
         for name in ("SearchSensors", "SearchPerception"):
@@ -134,39 +129,35 @@ def test_pictures_of_another_width():
 
 
 def test_scenes_follow_the_world_and_do_not_depend_on_when_one_looks():
-    lot = make_scenario("mini").lot
-    short_stays = OccupancyProcess.from_demand(np.zeros(lot.n_slots), np.zeros(168), 300.0)
+    short_stays = OccupancyProcess.from_demand(np.zeros(LOT.n_slots), np.zeros(168), 300.0)
     scenario = make_scenario("mini", occupancy=short_stays)
-    slots, key = slot_lot(lot), np.uint64(77)
+    slots, key = slot_lot(LOT), np.uint64(77)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
 
     def scenes():
         return LotScenes(slots, scenario, key, scenario.occupancy.world(key, arrival))
 
     often, seldom = scenes(), scenes()
-    world = scenario.occupancy.world(key, arrival)
-    cars = set()
+    world, cars = scenario.occupancy.world(key, arrival), set()
     for minute in range(0, 60, 2):
         time = arrival.time + 60.0 * minute
         scene = often.at(time)
         np.testing.assert_array_equal(
-            np.isin(np.arange(lot.n_slots), scene.present), world.occupied(np.arange(lot.n_slots), time)
+            np.isin(np.arange(LOT.n_slots), scene.present), world.occupied(np.arange(LOT.n_slots), time)
         )
         cars |= {tuple(p) for p in scene.vehicle_pose[scene.present]}
     late = seldom.at(time)
     np.testing.assert_array_equal(late.vehicle_model, scene.vehicle_model)
     np.testing.assert_array_equal(late.vehicle_pose[late.present], scene.vehicle_pose[scene.present])
-    assert len(cars) > 2 * lot.n_slots  # another car comes after one has left
+    assert len(cars) > 2 * LOT.n_slots  # another car comes after one has left
 
 
 @pytest.mark.parametrize("name", ["campus", "street"])
 def test_traffic_keeps_to_its_ways(name):
     lot = make_scenario(name).lot
     traffic = LotTraffic(lot, 0, Traffic(cars=6, pedestrians=0), np.uint64(3), slot_lot(lot))
-    slots = STRtree(polygons(lot.slot_corners()))
-    touching = 0
-    times = np.arange(0.0, 120.0, 2.0)
-    before = None
+    slots, touching = STRtree(polygons(lot.slot_corners())), 0
+    times, before = np.arange(0.0, 120.0, 2.0), None
     for time in times:
         pose = traffic.at(time).vehicle_pose
         assert len(pose) == 6
@@ -216,8 +207,7 @@ def test_all_road_users_are_where_each_would_be_alone(name, monkeypatch):
 
 
 def test_nobody_is_in_the_searching_cars_way():
-    lot = make_scenario("mini").lot
-    traffic = LotTraffic(lot, 0, Traffic(cars=3, pedestrians=4), np.uint64(1), slot_lot(lot))
+    traffic = LotTraffic(LOT, 0, Traffic(cars=3, pedestrians=4), np.uint64(1), slot_lot(LOT))
     for time in np.arange(0.0, 60.0, 3.0):
         everyone = traffic.at(time)
         ego = everyone.vehicle_pose[0]
@@ -227,39 +217,34 @@ def test_nobody_is_in_the_searching_cars_way():
 
 
 def test_movers_are_drawn_scanned_and_numbered_after_the_parked_cars():
-    lot = make_scenario("mini").lot
-    parked = slot_lot(lot).scene(np.ones(lot.n_slots, bool))
-    x, y = lot.vertex_xy[0]
+    parked = slot_lot(LOT).scene(np.ones(LOT.n_slots, bool))
+    x, y = LOT.vertex_xy[0]
     ahead = np.array([[x, y + 4.0, 0.3]])
     walker = np.array([[x + 4.0, y, 0.0]]), np.array([0.2]), np.array([1])
     moving = parked.with_movers(Movers(ahead, np.array([2]), *walker))
     pose = np.array([x, y, 0.0])
-    left = Mount(z=1.1, yaw=LEFT).camera_pose(pose)
-    camera = PinholeCamera()
-    boxes = vehicle_boxes(camera, moving, left, camera.render(moving, left))
-    assert lot.n_slots + 1 in boxes.ids
-    assert lot.n_slots + 1 not in vehicle_boxes(camera, parked, left, camera.render(parked, left)).ids
+    left, camera = Mount(z=1.1, yaw=LEFT).camera_pose(pose), PinholeCamera()
+    assert LOT.n_slots + 1 in vehicle_boxes(camera, moving, left, camera.render(moving, left)).ids
+    assert LOT.n_slots + 1 not in vehicle_boxes(camera, parked, left, camera.render(parked, left)).ids
     laser = LaserScanner()
     still, _ = laser.scan_with_ids(parked.scan_plane, pose)
     scan, ids = laser.scan_with_ids(moving.scan_plane, pose)
-    assert (ids == lot.n_slots + 1).sum() > 20
+    assert (ids == LOT.n_slots + 1).sum() > 20
     assert (scan <= still).all()
     assert scan[540] < 4.0  # someone walks straight ahead
     assert ids[540] == 0
 
 
 def test_moving_shadows_are_those_of_a_scene_made_anew():
-    lot = make_scenario("mini").lot
-    slots = slot_lot(lot)
-    parked = slots.scene(np.ones(lot.n_slots, bool))
-    x, y = lot.vertex_xy[0]
+    slots = slot_lot(LOT)
+    parked = slots.scene(np.ones(LOT.n_slots, bool))
+    x, y = LOT.vertex_xy[0]
     movers = Movers(np.array([[x + 3.0, y + 1.0, 0.1]]), np.array([4]))
     eye = Mount(z=1.1, yaw=0.0).camera_pose(np.array([x - 6.0, y, 0.0]))
     camera = PinholeCamera()
     camera.render(parked, eye)  # its shadows are kept, and the mover's are added
     kept = camera.render(parked.with_movers(movers), eye)
-    fresh_scene = slots.scene(np.ones(lot.n_slots, bool)).with_movers(movers)
-    fresh = camera.render(fresh_scene, eye)
+    fresh = camera.render(slots.scene(np.ones(LOT.n_slots, bool)).with_movers(movers), eye)
     np.testing.assert_array_equal(kept.image, fresh.image)
     ground = (kept.ids == 0) & (kept.depth < 12.0)
     without = camera.render(parked, eye).image.astype(int)
@@ -349,8 +334,7 @@ def test_smaller_pictures_show_the_same(scene):
     one, other = (rig.capture(scene, POSE, seed=1).images["right"].image for rig in (large, small))
     halved = one.reshape(240, 2, 320, 2, 3).mean(axis=(1, 3))
     assert np.abs(halved - other).mean() < 8.0
-    stereo = SensorRig.stereo().resized(400)
-    assert stereo.stereo_cameras[0][1].camera.height == 300
+    assert SensorRig.stereo().resized(400).stereo_cameras[0][1].camera.height == 300
     with pytest.raises(SensorError, match="width is 0"):
         large.resized(0)
 
@@ -372,12 +356,10 @@ def test_beams_that_hit_a_vehicle_and_the_cameras_depth_agree(scene, yaw):
     capture = rig.capture(scene, POSE)
     (_, camera, _), (_, laser, _) = rig.cameras[0], rig.lasers[0]
     ranges, ids = laser.scan_with_ids(scene.scan_plane, POSE)
-    frame = capture.images["camera"]
-    bearing = laser.angles - yaw
+    frame, bearing = capture.images["camera"], laser.angles - yaw
     column = camera.cx - camera.fx * np.tan(np.clip(bearing, -1.4, 1.4))
     inside = (np.abs(bearing) < 0.5) & (ids > 0)
-    pixel = np.floor(column[inside]).astype(int)
-    row = int(camera.cy)
+    pixel, row = np.floor(column[inside]).astype(int), int(camera.cy)
     depth = np.minimum(frame.depth, frame.glass_depth)[row, pixel]
     same_vehicle = frame.ids[row, pixel] == ids[inside]
     off = np.abs(depth - ranges[inside] * np.cos(bearing[inside]))[same_vehicle]
