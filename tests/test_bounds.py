@@ -88,9 +88,6 @@ class StillWorld(World):
         return self._law
 
 
-SHAPES = ((1, 4), (2, 2), (2, 3), (1, 6), (3, 2), (1, 5))
-
-
 def means(problem, p_taken, entry, most_states=4_000):
     """The optimum, the bound and the clairvoyant bound, over all worlds that there are."""
     routes, bound, mean, clairvoyant = DriveRoutes(problem), SearchBound(problem, most_states), 0.0, 0.0
@@ -121,8 +118,7 @@ def test_the_law_of_a_world_is_that_of_its_slots_on_its_day():
     taken, after, stayed = [], [], []
     for seed in range(300):
         world = model.world(world_key(seed, 0), arrival)
-        law = world.law()
-        here = world.occupied(slots, arrival.time)
+        law, here = world.law(), world.occupied(slots, arrival.time)
         taken.append((here - law.p_taken).mean())
         after.append((world.occupied(slots, arrival.time + 900.0) - law.p_taken_after(900.0)).mean())
         stays = law.stays(0.0, 900.0)
@@ -154,9 +150,7 @@ def best_schedule_s(day):
 
     def total_s(places):
         groups = [[car for car in range(n_cars) if places[car] == slot] for slot in slots]
-        orders = (
-            (in_order_s(day, slot, order) for order in itertools.permutations(groups[slot])) for slot in slots
-        )
+        orders = [[in_order_s(day, s, order) for order in itertools.permutations(groups[s])] for s in slots]
         return day.give_up_s * places.count(-1) + sum(map(min, orders))
 
     return min(map(total_s, itertools.product((-1, *slots), repeat=n_cars)))

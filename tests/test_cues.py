@@ -49,13 +49,8 @@ def test_p_free_after_a_cue_is_that_of_the_chain(p, decay_rate):
     arriving, leaving = p * decay_rate, (1.0 - p) * decay_rate
     rate = leaving + 1 / 30
     usual = leaving / rate
-    rates = np.array(
-        [
-            [-leaving, leaving, 0.0],
-            [0.0, -rate, rate],
-            [arriving * (1.0 - usual), arriving * usual, -arriving],
-        ]
-    )
+    arrives = arriving * np.array([1.0 - usual, usual, -1.0])
+    rates = np.array([[-leaving, leaving, 0.0], [0.0, -rate, rate], arrives])
     for about in (0.0, 0.4, 1.0):
         for t in (0.5, 10.0, 60.0, 600.0):
             free = (np.array([1.0 - about, about, 0.0]) @ expm(rates * t))[2]
@@ -68,15 +63,8 @@ def test_drawn_changes_agree_with_all_looks_and_are_not_at_once():
     second = np.tile(np.arange(8 * 3600.0, 18 * 3600.0, 1800.0), 50)
     slot = np.repeat(np.arange(50), 20)
     taken = rng.random(slot.size) < 0.7
-    days = np.repeat([0, 1], slot.size)
-    log = OccupancyLog(
-        tuple(map(str, range(50))),
-        (day, "2024-01-02"),
-        np.tile(slot, 2),
-        days,
-        np.tile(second, 2),
-        np.tile(taken, 2),
-    )
+    looks = (np.tile(slot, 2), np.repeat([0, 1], slot.size), np.tile(second, 2), np.tile(taken, 2))
+    log = OccupancyLog(tuple(map(str, range(50))), (day, "2024-01-02"), *looks)
     changes = {}
     for kind in ("midway", "drawn"):
         model = RecordedOccupancy(log, np.arange(50.0), np.arange(50), changes=kind)
@@ -128,17 +116,12 @@ def test_the_belief_after_cues_is_calibrated(cues):
 
 def test_without_cues_all_is_as_before_and_with_them_the_world_is_the_same():
     plain, cued = busy(), busy(Cues(moving_s=0.0))
-    space = gym.make("parkenv/Search-v2", scenario=plain).observation_space
-    assert "cues" not in space.spaces
+    assert "cues" not in gym.make("parkenv/Search-v2", scenario=plain).observation_space.spaces
     for seed in range(5):
-        totals = [
-            parkenv.simulate(
-                gym.make("parkenv/Search-v2", scenario=scenario),
-                make_agent("first-free", scenario),
-                seed=seed,
-            ).info["total_s"]
-            for scenario in (plain, cued)
-        ]
+        totals = []
+        for scenario in (plain, cued):
+            env, agent = gym.make("parkenv/Search-v2", scenario=scenario), make_agent("first-free", scenario)
+            totals.append(parkenv.simulate(env, agent, seed=seed).info["total_s"])
         assert totals[0] == totals[1]
 
 
@@ -215,9 +198,8 @@ def test_belief_gains_from_cues_in_a_nearly_full_lot():
     for cues in (None, Cues(20.0), Cues(20.0, 0.5, 0.02)):
         scenario = busy(cues, p=0.995, stay_s=1800.0)
         env, agent = gym.make("parkenv/Search-v2", scenario=scenario), make_agent("belief", scenario)
-        totals[cues] = np.array(
-            [parkenv.simulate(env, agent, seed=seed).info["total_s"] for seed in range(100)]
-        )
+        done = [parkenv.simulate(env, agent, seed=seed) for seed in range(100)]
+        totals[cues] = np.array([search.info["total_s"] for search in done])
     none, perfect, sensed = totals.values()
     assert (perfect - none).mean() < -20.0
     assert (sensed - none).mean() < -20.0
@@ -271,8 +253,7 @@ def test_what_does_not_know_cues_says_so(tmp_path):
         Cues(hit_rate=0.1, false_alarm_rate=0.2)
     for given in ("often", "0.5", "0.5,0.1,31,9"):
         done = command("compare", "--cues", given, "--out", tmp_path / "run")
-        assert done.returncode == 2
-        assert done.stderr.count("\n") == 1
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
 
 
 def test_the_command_line_and_files_have_cues():

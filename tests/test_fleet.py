@@ -49,9 +49,8 @@ from planners.model_file import save_model
 from planners.routes import DriveRoutes
 
 ALL_POLICIES = POLICIES | {ORDERED_ENTRY.name: ORDERED_ENTRY}
-NOISY = SensorModel(
-    15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
-)
+BANDS = SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2)
+NOISY = SensorModel(15.0, bands=BANDS)
 GREEDY = DriverKind(policy=POLICIES["greedy-drive"])
 
 
@@ -139,31 +138,14 @@ def random_fleet(lot_seed, n_cars, background, kinds, stay_s, patience_s, option
     return fleet
 
 
-kinds_of_drivers = st.tuples(
-    st.sampled_from([*ALL_POLICIES, "python"]),
-    st.sampled_from(["own", "shared", "reserve", "full"]),
-    st.booleans(),
-)
-some_options = st.fixed_dictionaries(
-    {},
-    optional={
-        "tick_s": st.sampled_from([0.3, 1.0]),
-        "delay_s": st.sampled_from([5.0, 600.0]),
-        "leave_full_lot": st.just(False),
-        "manoeuvre_s": st.sampled_from([3.0, 40.0]),
-        "sees_cars": st.just(True),
-    },
-)
-fleets = st.tuples(
-    st.integers(0, 323),
-    st.integers(1, 30),
-    st.sampled_from(["process", "residents", "none"]),
-    st.lists(kinds_of_drivers, min_size=1, max_size=3),
-    st.sampled_from([30.0, 600.0, 1e5]),
-    st.sampled_from([40.0, math.inf]),
-    some_options,
-    st.integers(0, 1000),
-)
+one_of = st.sampled_from
+kinds = st.tuples(one_of([*ALL_POLICIES, "python"]), one_of("own shared reserve full".split()), st.booleans())
+times = {"delay_s": one_of([5.0, 600.0]), "tick_s": one_of([0.3, 1.0]), "manoeuvre_s": one_of([3.0, 40.0])}
+switches = {"leave_full_lot": st.just(False), "sees_cars": st.just(True)}
+worlds = st.integers(0, 323), st.integers(1, 30), one_of(["process", "residents", "none"])
+drivers = st.lists(kinds, min_size=1, max_size=3), one_of([30.0, 600.0, 1e5]), one_of([40.0, math.inf])
+some_options = st.fixed_dictionaries({}, optional=times | switches)
+fleets = st.tuples(*worlds, *drivers, some_options, st.integers(0, 1000))
 
 
 def check_state(fleet, time):
@@ -215,8 +197,7 @@ def test_equal_seeds_give_equal_runs_and_demand_does_not_depend_on_drivers(argum
     for background, kinds in ((None, None), (None, None), ("none", [("random", "own", False)])):
         changed = list(arguments)
         changed[2], changed[3] = background or arguments[2], kinds or arguments[3]
-        fleet = random_fleet(*changed)
-        rng = np.random.default_rng(0)
+        fleet, rng = random_fleet(*changed), np.random.default_rng(0)
         while fleet.next_decision() is not None:
             fleet.act(rng.integers(5))
         runs.append(fleet.cars.copy())
@@ -230,14 +211,12 @@ def test_the_first_car_at_a_slot_has_it_and_the_second_fails():
     class Park:
         def predict(self, observation, state=None):
 
-            routes = DriveRoutes(scenario)
-            vertex = int(observation["vertex"])
+            routes, vertex = DriveRoutes(scenario), int(observation["vertex"])
             return (4 if vertex == 0 else routes.move_toward(vertex, 0)), state
 
     scenario = parkenv.make_scenario("mini")
     demand = Demand(ListedArrivals((36000.0, 36000.0)), ConstantTime(15.0))
-    fleet = driven(Fleet(scenario, demand, background="none"), 0, agents=[Park()])
-    first, second = fleet.cars
+    first, second = driven(Fleet(scenario, demand, background="none"), 0, agents=[Park()]).cars
     assert (first["failed_parks"], second["failed_parks"]) == (0, 2)
     assert first["slot"] == second["slot"] == 0
     assert second["ended_at"] - first["ended_at"] == pytest.approx(2 * scenario.failure_s)
@@ -337,8 +316,7 @@ DEMAND = Demand(PoissonArrivals(60.0, 8 * 3600, 8.5 * 3600), ExponentialTime(480
 
 
 def small(algorithm):
-    policy = {"net_arch": [16, 8]}
-    venv = SearchVecEnv(3, "mini")
+    policy, venv = {"net_arch": [16, 8]}, SearchVecEnv(3, "mini")
     return algorithm("MultiInputPolicy", venv, seed=0, device="cpu", policy_kwargs=policy)
 
 

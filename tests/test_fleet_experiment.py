@@ -52,8 +52,7 @@ def days_of(study):
 def test_gini_and_the_search_by_random_looks_have_their_closed_forms():
     assert gini(np.array([2.0, 2.0, 2.0])) == gini(np.zeros(3)) == 0.0
     assert gini(np.array([1.0, 3.0])) == pytest.approx(0.25)
-    exponential = np.random.default_rng(0).exponential(size=20_000)
-    assert gini(exponential) == pytest.approx(0.5, abs=0.01)
+    assert gini(np.random.default_rng(0).exponential(size=20_000)) == pytest.approx(0.5, abs=0.01)
     problem = SearchProblem(lot=grid_lot(1, 20))
     one, all_but_none = random_order_search_s(problem, np.array([0.0, 1.0]))
     hop_s = 2.5 / problem.v_drive
@@ -102,8 +101,7 @@ def test_measures_of_a_day_are_those_of_its_cars():
 
 
 def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
-    study = experiment(knows=("own", "reserve"), arrivals_per_hour=(15.0, 30.0), days=3)
-    days = days_of(study)
+    days = days_of(experiment(knows=("own", "reserve"), arrivals_per_hour=(15.0, 30.0), days=3))
     rows = summarize_days(days)
     for row in rows:
         low, high = row["price_of_anarchy_ci95"]
@@ -139,13 +137,11 @@ def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
         changed = crowded.changed(**{name: value})
         assert changed.settings() != crowded.settings()
         assert getattr(changed.fleet(changed.fleet_settings[0])[0].options, name) == value
-    measured = Calibration("mini", 2.0, 15.0, 14.0, 40, 2.8)
-    measured.to_file(tmp_path / "calibrated.json")
+    Calibration("mini", 2.0, 15.0, 14.0, 40, 2.8).to_file(tmp_path / "calibrated.json")
     calibrated = crowded.changed(calibrated=tmp_path / "calibrated.json")
     (built,) = calibrated.built.values()
     assert (built.v_drive, built.failure_s) == (2.0, 15.0)
-    assert calibrated.blocked_s == 14.0
-    assert calibrated.changed(manoeuvre_s=0.0).blocked_s == 0.0
+    assert (calibrated.blocked_s, calibrated.changed(manoeuvre_s=0.0).blocked_s) == (14.0, 0.0)
     (day,), (queueing,) = days_of(crowded)[0], days_of(calibrated)[0]
     assert (day["queued_s"], queueing["cars"]) == (0.0, day["cars"])
     assert 0.0 < queueing["queued_s"] < queueing["search_s"]
@@ -216,8 +212,7 @@ def test_changes_are_paired_by_day_and_by_car(days):
     assert row["members_change_s"] == pytest.approx(np.mean(gains)), "members are compared with themselves"
     assert row["better_off"] == pytest.approx(np.mean(faster))
     assert row["better_off"] + row["worse_off"] <= 1.0
-    assert row["before"] == "own observations"
-    assert row["after"] == "reservations for 50 %"
+    assert (row["before"], row["after"]) == ("own observations", "reservations for 50 %")
 
 
 def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():
@@ -288,8 +283,7 @@ def test_the_command_writes_rows_days_and_a_figure(run):
 
 def test_the_data_replay_the_days_of_the_run(run):
     data = data_of(run / "report.html")
-    assert data["run"]["title"] == "Many cars on mini"
-    assert len(data["run"]["findings"]) == 1
+    assert (data["run"]["title"], len(data["run"]["findings"])) == ("Many cars on mini", 1)
     assert len(data["fleets"]) == 8
     assert all(day["agrees"] for day in data["fleets"])
     names = ("arrivals_per_hour", "knows", "share")

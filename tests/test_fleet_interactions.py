@@ -90,8 +90,7 @@ def test_cars_that_park_or_leave_block_those_behind_them_and_queues_dissolve():
 
 
 def test_the_car_that_waits_for_one_that_leaves_has_the_slot():
-    slot = int(by_distance()[2])
-    states = {}
+    slot, states = int(by_distance()[2]), {}
     for cues in (None, Cues(lead_s=1e6, moving_s=0.0)):
         # The first leaves while the second stands in a failed attempt; the third comes by in between.
         demand = Demand(ListedArrivals((36000.0, 36040.0, 36049.0)), ConstantTime(46.0))
@@ -99,8 +98,7 @@ def test_the_car_that_waits_for_one_that_leaves_has_the_slot():
         drive(fleet, [slot] * 3)
         states[cues is None] = np.argsort(fleet.cars["ended_at"]).tolist()
         assert (fleet.slots["held_by"] == -1).all()
-    assert states[True] == [0, 2, 1]
-    assert states[False] == [0, 1, 2]
+    assert (states[True], states[False]) == ([0, 2, 1], [0, 1, 2])
 
 
 def test_cars_see_others_in_view_and_where_one_stands():
@@ -257,8 +255,7 @@ def test_knowing_more_helps_and_guidance_helps_most():
 @pytest.mark.parametrize("knows", ["own", "full", "reserve"])
 def test_a_full_lot_is_left_at_once_or_searched_until_patience_ends(knows):
     demand = Demand(Headways(25, 1.0), ConstantTime(math.inf), ConstantTime(300.0))
-    kinds = [DriverKind(policy=POLICIES["greedy-drive"], knows=knows)]
-    searched = {}
+    kinds, searched = [DriverKind(policy=POLICIES["greedy-drive"], knows=knows)], {}
     for leave in (True, False):
         fleet = driven(Fleet("mini", demand, background="none", drivers=kinds, leave_full_lot=leave), 0)
         names, n = np.array(fleet.state_names()), fleet.scenario.lot.n_slots

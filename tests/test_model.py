@@ -21,17 +21,14 @@ from parkenv.world.lot import PARK
 from planners import make_agent
 from planners.heuristics.policies import POLICIES
 
-NOISY = SensorModel(
-    view_range=9.0, bands=(SensorBand(4.0, True, 0.9, 0.9, 0.1), SensorBand(9.0, False, 0.6, 0.8, 0.3))
-)
+NOISY = SensorModel(9.0, bands=(SensorBand(4.0, True, 0.9, 0.9, 0.1), SensorBand(9.0, False, 0.6, 0.8, 0.3)))
 SENSORS = {"exact": SensorModel(view_range=6.0), "noisy": NOISY}
 START = {"entry": 0, "arrival": "Tue 09:10"}
 
 
 def searching(sensor="exact", name="mini", **changes):
     scenario = parkenv.make_scenario(name, sensor_model=SENSORS[sensor], **changes)
-    env = gym.make("parkenv/Search-v2", scenario=scenario)
-    return env, parkenv.model(scenario)
+    return gym.make("parkenv/Search-v2", scenario=scenario), parkenv.model(scenario)
 
 
 def random_action(observation, rng, n_actions=PARK + 1):
@@ -126,8 +123,7 @@ def test_no_key_of_the_world_can_be_reached():
         action = random_action(observation, rng, PARK)
         observation, *_ = env.step(action)
         belief = model.update(belief, action, observation)
-    state = model.sample(belief, rng)
-    record = env.unwrapped.searches.records[0]
+    state, record = model.sample(belief, rng), env.unwrapped.searches.records[0]
     hidden = [record[name].tobytes() for name in ("key", "seed_state")]
     assert any(hidden[0] in found for found in numbers_in(env.unwrapped.searches)), "the walk finds it there"
     for found in numbers_in(model, belief, state):
@@ -139,8 +135,7 @@ def test_a_step_leaves_its_state_and_only_new_random_numbers_change_what_comes()
     belief, rng = model.initial_belief(env.reset(seed=0)[0]), np.random.default_rng(0)
     state = model.sample(belief, rng)
     many = model.sample(belief, np.random.default_rng(0), 1, copies=3)
-    before = state.searches.records.tobytes()
-    futures = []
+    before, futures = state.searches.records.tobytes(), []
     for reseeded in (False, False, True):
         now, told = state, []
         for action in (3, 3, 3, 0, 3, 3):
@@ -160,15 +155,14 @@ def test_bad_input_is_answered_in_one_line():
     env, model = searching()
     observation, _ = env.reset(seed=0)
     belief, rng = model.initial_belief(observation), np.random.default_rng(0)
-    other_env, other = searching(name="campus")
+    elsewhere, other = searching(name="campus")
+    there = other.initial_belief(elsewhere.reset(seed=0)[0])
     state = model.sample(belief, rng)
     calls = {
         "lot 'mini'": lambda: other.sample(belief, rng),
         "slots, want": lambda: other.initial_belief(observation),
         "action is 7": lambda: model.step(state, 7),
-        "lot 'campus'": lambda: model.step(
-            other.sample(other.initial_belief(other_env.reset(seed=0)[0]), rng), 0
-        ),
+        "lot 'campus'": lambda: model.step(other.sample(there, rng), 0),
         "holds 2": lambda: model.step(model.sample(belief, rng, 2), 0),
         "policy is 'first-free'": lambda: state.run("first-free"),
         "i is 1": lambda: state.one(1),
@@ -282,12 +276,8 @@ class Read:
 
 def few_slots(seed):
     """Three or four slots along one or two aisles."""
-    problem, p_occupied, entry = small_lot(seed, ((1, 3), (2, 2), (1, 4)))
-    return (
-        problem,
-        p_occupied,
-        entry if seed % 2 else int(np.random.default_rng(seed).integers(len(p_occupied))),
-    )
+    problem, p_occupied, vertex = small_lot(seed, ((1, 3), (2, 2), (1, 4)))
+    return problem, p_occupied, vertex if seed % 2 else np.random.default_rng(seed).integers(len(p_occupied))
 
 
 @pytest.mark.parametrize("seed", range(6))

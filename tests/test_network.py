@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from functools import partial
 from importlib import import_module
 
 import gymnasium as gym
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from small_lots import full_lot
 
+import parkenv
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot
@@ -50,8 +52,7 @@ def test_turning_the_map_changes_nothing(name):
     order = [2, 3, 1, 0]  # up becomes left, and so on
     turned._neighbors = turned._neighbors[:, order].copy()
     turned._move_s = turned._move_s[:, order].copy()
-    found = decisions(agent, scenario, seed=3)
-    memory = None
+    found, memory = decisions(agent, scenario, seed=3), None
     rows = [*order, PARKING, WAITING]
     for observation, _, features, scores in found:
         _, memory = turned.predict(observation, memory)
@@ -104,13 +105,11 @@ def test_only_actions_that_there_are_are_taken(seed):
         if observation["action_mask"][action] == 0:  # waiting
             assert scores.argmax() == WAITING
         if action == PARKING:
-            belief = SlotBelief.of_observation(observation)
-            assert not belief.observed_taken[observation["vertex"]]
+            assert not SlotBelief.of_observation(observation).observed_taken[observation["vertex"]]
 
 
 def test_the_look_ahead_knows_the_shortest_drive_and_walk_where_all_slots_are_free():
-    scenario = make_scenario(grid_lot(4, 12), day_error=0.0)
-    problem = scenario.public()
+    problem = make_scenario(grid_lot(4, 12), day_error=0.0).public()
     agent = NetworkAgent(problem, random_policy())
     belief = SlotBelief.of_forecast(np.full(problem.lot.n_slots, 1e-9), np.zeros(problem.lot.n_slots))
     vertex = int(problem.lot.entry_vertices[0])
@@ -134,8 +133,7 @@ def example():
 def test_numpy_and_torch_agree(example):
     import torch
 
-    rng = np.random.default_rng(0)
-    n = 32
+    rng, n = np.random.default_rng(0), 32
     tokens = rng.uniform(-1.0, 1.0, (n, 6, CANDIDATES, TOKEN_FEATURES)).astype(np.float32)
     tokens[..., 0] = rng.random((n, 6, CANDIDATES)) < 0.7
     actions = rng.uniform(0.0, 1.0, (n, 6, ACTION_FEATURES)).astype(np.float32)
@@ -161,6 +159,7 @@ def test_trained_weights_are_repeatable_and_drive(example, tmp_path, monkeypatch
     few_of = {"SCENARIOS": ("mini",), "DECISIONS": 20, "EPOCHS": 20, "BATCH": 16, "WORLDS": 2}
     for name, few in few_of.items():
         monkeypatch.setattr(example, name, few)
+    monkeypatch.setattr(parkenv, "compare", partial(parkenv.compare, jobs=1))
     files = []
     for _ in range(2):
         example.main()
@@ -248,8 +247,7 @@ def test_it_parks_and_repeats_itself(name):
 
 def test_without_news_it_does_not_circle_forever():
     """A network that always wants to turn back is made to drive on."""
-    scenario = make_scenario("campus")
-    policy = random_policy()
+    scenario, policy = make_scenario("campus"), random_policy()
     for weights in policy.weights.values():
         weights[...] = 0.0
     agent = NetworkAgent(scenario, policy)
