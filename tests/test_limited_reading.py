@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from lot_checks import refusal
 
 from parkenv import InputError
 from parkenv.files import csv_tables, limited_reading
@@ -83,8 +84,7 @@ def test_bytes_are_counted_unpacked(tmp_path):
     with pytest.raises(InputError, match="has more than 9,999,999 bytes"):
         limited_reading.read_bytes(tmp_path / "a.gz", 9_999_999)
     (tmp_path / "a.gz").write_bytes(gzip.compress(b"abc" * 1000)[:-9])
-    with pytest.raises(InputError, match="not a whole gzip file"):
-        limited_reading.read_bytes(tmp_path / "a.gz")
+    assert "not a whole gzip file" in refusal(limited_reading.read_bytes, tmp_path / "a.gz")
 
 
 @pytest.mark.parametrize("name", ["absent", ".", "a\0b", "\ud800", "x" * 300])
@@ -102,8 +102,7 @@ def test_pipes_devices_and_files_that_state_no_size_are_not_waited_for(tmp_path)
     for name in ("pipe", "link", *devices):
         with pytest.raises(InputError, match=r"is a pipe or a device, want a file|No such"):
             limited_reading.read_bytes(tmp_path / name)
-    with pytest.raises(InputError, match="is not a file"):
-        MapStore(tmp_path / "pipe", packaged_lot("mini"), create=False)
+    assert "is not a file" in refusal(MapStore, tmp_path / "pipe", packaged_lot("mini"), create=False)
     for name in ("proc", "proc.gz"):
         (tmp_path / name).symlink_to("/proc/version")  # /proc/kmsg, which waits, needs rights
         assert limited_reading.read_bytes(tmp_path / name) == b""
@@ -113,11 +112,9 @@ def test_csv_rows_have_one_width(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text('a,b\n1,"2\n3"\n\n4')
     assert next(limited_reading.csv_records(path)) == (3, {"a": "1", "b": "2\n3"})
-    with pytest.raises(InputError, match="line 5: has 1 fields, want 2"):
-        list(limited_reading.csv_rows(path))
+    assert "line 5: has 1 fields, want 2" in refusal(list, limited_reading.csv_rows(path))
     path.write_text("a\n" + "x" * 200_000)
-    with pytest.raises(InputError, match="line 2: not CSV: field larger"):
-        list(limited_reading.csv_rows(path))
+    assert "line 2: not CSV: field larger" in refusal(list, limited_reading.csv_rows(path))
 
 
 def test_a_zip_is_measured_before_it_is_unpacked():
@@ -127,13 +124,11 @@ def test_a_zip_is_measured_before_it_is_unpacked():
         limited_reading.parse_zip(data, "a", 500)
     with pytest.raises(InputError, match="holds 10,001 files"):
         limited_reading.parse_zip(zipped(**{str(i): "" for i in range(limited_reading.MAX_MEMBERS + 1)}), "a")
-    with pytest.raises(InputError, match="not a zip archive"):
-        limited_reading.parse_zip(b"PK\x03\x04 no zip", "a")
+    assert "not a zip archive" in refusal(limited_reading.parse_zip, b"PK\x03\x04 no zip", "a")
     otherwise = io.BytesIO()
     with zipfile.ZipFile(otherwise, "w", zipfile.ZIP_LZMA) as archive:
         archive.writestr("a", b"x" * 1000)
-    with pytest.raises(InputError, match="deflate"):
-        limited_reading.parse_zip(otherwise.getvalue(), "a")
+    assert "deflate" in refusal(limited_reading.parse_zip, otherwise.getvalue(), "a")
 
 
 def test_arrays_are_read_as_numpy_wrote_them(tmp_path):

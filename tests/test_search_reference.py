@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from lot_checks import refusal
 from search_reference import ReferenceSearch
 from test_supply import FORBIDDEN, GARAGE, town
 
@@ -307,8 +308,7 @@ def test_held_observations_stay_and_equal_those_that_are_overwritten(mode, kept)
 
 
 def test_a_lot_of_thousands_of_slots_touches_only_what_is_near():
-    scenario = make_scenario(city_lot(3_000))
-    envs = make_batch(2, scenario, observation="local")
+    envs = make_batch(2, make_scenario(city_lot(3_000)), observation="local")
     envs.reset(seed=0)
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -368,16 +368,12 @@ def test_wrong_use_is_refused():
     envs = make_batch(2, "mini")
     with pytest.raises(InputError, match="option of reset is 'speed', want one of scenario, entry, arrival"):
         envs.reset(options={"speed": 1})
-    with pytest.raises(InputError, match="seed holds 3 numbers, want 2"):
-        envs.reset(seed=[1, 2, 3])
-    with pytest.raises(InputError, match="leaves out"):
-        envs.reset(options={"reset_mask": np.array([True, False])})
+    assert "seed holds 3 numbers, want 2" in refusal(envs.reset, seed=[1, 2, 3])
+    assert "leaves out" in refusal(envs.reset, options={"reset_mask": np.array([True, False])})
     envs.reset(seed=0)
-    with pytest.raises(InputError, match="reset_mask has shape"):
-        envs.reset(options={"reset_mask": np.array([True])})
+    assert "reset_mask has shape" in refusal(envs.reset, options={"reset_mask": np.array([True])})
     for wrong in (np.zeros(3, dtype=int), np.zeros(2), np.zeros((2, 1), dtype=int)):
-        with pytest.raises(InputError, match="actions have shape"):
-            envs.step(wrong)
+        assert "actions have shape" in refusal(envs.step, wrong)
     before = envs._searches.records.copy()
     for wrong in (5, -1):
         with pytest.raises(InputError, match=rf"actions\[1\] is {wrong}, want a number from 0 to 4"):

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from small_lots import CAR_PARKS, driven
 
-from parkenv import InputError, make_agent, make_scenario
+from parkenv import make_agent, make_scenario
 from parkenv.driving.driven_lines import DrivenLines
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.sensor_sampler import make_rig
@@ -131,16 +131,14 @@ def test_nobody_ever_makes_a_forbidden_turn(turns, seed):
     fleet.reset(seed)
     fleet.keep_steps()
     fleet.run()
-    steps = fleet.take_steps()
-    drives = set()
+    steps, drives = fleet.take_steps(), set()
     for car in np.unique(steps["car"]).tolist():
         of_car = steps[steps["car"] == car]
         drives |= made(lot, of_car["origin"].tolist(), of_car["vertex"].tolist())
     assert drives
     for one in turns:
         comes, at, leaves = one.points
-        arms = [arm_of(comes - at), arm_of(leaves - at)]
-        at = tuple(at.tolist())
+        arms, at = [arm_of(comes - at), arm_of(leaves - at)], tuple(at.tolist())
         those = {last for first, where, last in drives if (first, where) == (arms[0], at)}
         assert those <= {arms[1]} if one.only else arms[1] not in those
 
@@ -267,8 +265,7 @@ def test_left_hand_traffic_is_kept_in_files_and_imports_turn_parked_cars(tmp_pat
     np.testing.assert_allclose(lot.mouth_xy(), plain.mouth_xy(), atol=1e-9)
     assert lot.n_vertices == plain.n_vertices
     path.write_text(path.read_text().replace('"traffic": "left"', '"traffic": "middle"'))
-    with pytest.raises(InputError, match="traffic is 'middle', want 'left' or 'right'"):
-        read_lot(path)
+    assert "traffic is 'middle', want 'left' or 'right'" in refusal(read_lot, path)
     write_lot(packaged_lot("mini"), tmp_path / "mini.geojson")
     ran("lot", "import", str(tmp_path / "mini.geojson"), "--left-hand", "--out", str(tmp_path / "l.geojson"))
     assert read_lot(tmp_path / "l.geojson").left_hand
@@ -290,8 +287,7 @@ def test_a_mirrored_town_is_its_mirror_image(tmp_path, tags):
         place.way([(sign * 100, 0), (sign * 200, 0)], {"highway": "primary", "parking:both": "no"})
         for x in (-75, -25, 20, 85, 115):
             place.box(sign * x, -190, sign * (x + 5), 190, {"building": "house"})
-        path = place.write(tmp_path / f"{sign}.osm")
-        town = import_town(path, left_hand=sign < 0).draft
+        town = import_town(place.write(tmp_path / f"{sign}.osm"), left_hand=sign < 0).draft
         towns.append((town.in_left_hand_traffic() if sign < 0 else town).lot())
     right, left = towns
     assert left.n_slots == right.n_slots > 30
