@@ -139,8 +139,7 @@ class _Histories:
     def observe(self, vertex, belief, day, steps, memory):
         """Return the expected time, s, from the moment of an observation at a vertex."""
         in_view = self.problem.in_view(vertex)
-        new = in_view[~belief.observed[in_view]]
-        total = 0.0
+        new, total = in_view[~belief.observed[in_view]], 0.0
         for outcome in itertools.product((False, True), repeat=len(new)):
             taken = np.array(outcome, dtype=np.bool_)
             then = day * np.where(taken[:, None], 1.0 - self.p_free[new], self.p_free[new]).prod(axis=0)

@@ -29,12 +29,10 @@ def scan(scanner, plane, pose):
 
     # origin + r d = start + t (end - start), solved for the range r and the part t of the segment.
     p = np.concatenate(starts) - origin
-    e = np.concatenate(ends) - np.concatenate(starts)
-    angle = yaw + scanner.angles
+    e, angle = np.concatenate(ends) - np.concatenate(starts), yaw + scanner.angles
     d = np.column_stack([np.cos(angle), np.sin(angle)])[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        r = _cross(p, e) / _cross(d, e)
-        t = _cross(p, d) / _cross(d, e)
+        r, t = _cross(p, e) / _cross(d, e), _cross(p, d) / _cross(d, e)
     r = np.where((t >= 0) & (t <= 1) & (r > 0) & (r < scanner.max_range), r, np.inf)
     if r.shape[1] == 0:
         return np.full(scanner.n_beams, np.inf), np.full(scanner.n_beams, NO_RETURN)

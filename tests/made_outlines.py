@@ -16,8 +16,7 @@ def row(start, heading_deg, n, *, size=(5.0, 2.5), angle_deg=90.0, bend=0.0):
     spaces = []
     for _ in range(n):
         along = np.array([np.cos(heading), np.sin(heading)])
-        left = np.array([-along[1], along[0]])
-        angle = np.radians(angle_deg)
+        left, angle = np.array([-along[1], along[0]]), np.radians(angle_deg)
         nose = length * (np.cos(angle) * along + np.sin(angle) * left)
         pitch = width / np.sin(angle) * along
         spaces.append([at, at + pitch, at + pitch + nose, at + nose])

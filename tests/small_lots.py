@@ -61,8 +61,7 @@ def prices(lot, seed):
 def cut_in_two():
     """Two lots side by side; the entry leads into the western one alone."""
     west = grid_lot(2, 5)
-    f = features(west)
-    shift = np.array([200.0, 0.0])
+    f, shift = features(west), np.array([200.0, 0.0])
     n = west.n_slots
     return ParkingLot(
         **{

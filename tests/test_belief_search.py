@@ -98,8 +98,7 @@ def test_decisions_keep_to_their_budget(monkeypatch):
 
 def test_it_parks_at_once_in_an_empty_lot_that_is_known_to_be():
     lot = grid_lot(2, 20)
-    empty = lasting(lot, np.zeros(lot.n_slots, dtype=bool), said=-5.0)
-    row = search(empty)
+    row = search(lasting(lot, np.zeros(lot.n_slots, dtype=bool), said=-5.0))
     assert row["total_s"] == pytest.approx(row["bound_s"], abs=1.0)
 
 
@@ -290,8 +289,7 @@ def test_where_slots_vanish_it_prefers_the_free_slot_at_hand_to_a_better_one_fur
 def test_rivals_take_the_best_slots_whatever_is_observed_of_one():
     n = 40
     belief = SlotBelief.of_forecast(np.full(n, 0.6), np.full(n, 1e-3))
-    near = np.linspace(1.0, -1.0, n)
-    rates = np.zeros(n)
+    near, rates = np.linspace(1.0, -1.0, n), np.zeros(n)
     rates[:10] = 0.05
     calm = DayBelief(belief, near)
     crowd = DayBelief(belief, near, rival_rates=rates)

@@ -106,8 +106,7 @@ def test_a_task_weights_its_searches_and_uses_their_known_means(small, tmp_path,
     """Both strata of `mini` have the same worlds and known means of their own: the estimate is other, by hand."""
     mini = next(task for task in small.tasks if task.name == "mini")
     means = tuple(worlds_of(mini, small).mean(axis=0))
-    parts = tuple(Stratum(share, mini.seeds, means) for share in (0.25, 0.75))
-    task = replace(mini, strata=parts)
+    task = replace(mini, strata=tuple(Stratum(share, mini.seeds, means) for share in (0.25, 0.75)))
     suite = replace(small, tasks=(task,))
     cases = suite.cases([AgentSpec(name="first-free")])
     content = result_of(suite, cases, episodes_of(cases), ["parkenv"])
@@ -200,8 +199,7 @@ def test_searches_of_streets_begin_outside_at_their_hours_and_walk_to_their_goal
     assert (saturday.arrival.weekdays, saturday.arrival.start_s, saturday.goal) == ((5,), 12 * 3600.0, 18)
     assert full.occupancy.marginal(19.5 * 3600.0).mean() == pytest.approx(0.96)
     for scenario in (saturday, full):
-        away = np.hypot(*(scenario.lot.entries - scenario.lot.goals[scenario.goal]).T)
-        assert away.min() > 100.0
+        assert np.hypot(*(scenario.lot.entries - scenario.lot.goals[scenario.goal]).T).min() > 100.0
 
 
 BEGINNER = """

@@ -139,8 +139,7 @@ def test_a_counted_facility_is_a_block_of_its_capacity_and_a_square_at_its_place
     garage = Facility("other", "garage", capacity=600, xy=(30.0, 12.0))
     lot = ParkingLot(**features(plain) | {"facilities": (garage,)})
     blocks = Blocks.of(lot)
-    assert blocks.names == ("other (garage)", "other (zone)")
-    assert blocks.slots.tolist() == [600, 10]
+    assert (blocks.names, blocks.slots.tolist()) == (("other (garage)", "other (zone)"), [600, 10])
     square, slots = town_data(lot, ["", ""])["blocks"]
     assert square["at"] == [30.0, 12.0]
     corners = np.array(square["areas"][0][0]).reshape(-1, 2)

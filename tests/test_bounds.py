@@ -26,6 +26,8 @@ from planners.bounds.oracle import best_slot
 from planners.bounds.relaxation import SearchBound
 from planners.routes import DriveRoutes
 
+SHAPES = ((1, 4), (2, 2), (2, 3), (1, 6), (3, 2), (1, 5))
+
 
 @pytest.mark.parametrize("seed", range(0, 108, 25))
 def test_no_agent_takes_less_than_the_optimum(seed):

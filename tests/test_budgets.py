@@ -29,8 +29,7 @@ def sizes():
     for module in (
         path for top in ("parkenv", "planners", "sim_sensors") for path in (ROOT / top).rglob("*.py")
     ):
-        name = folder_of(module.relative_to(ROOT))
-        text = module.read_text()
+        name, text = folder_of(module.relative_to(ROOT)), module.read_text()
         lines[name] += len(text.splitlines())
         statements[name] += sum(isinstance(node, ast.stmt) for node in ast.walk(ast.parse(text)))
     return {name: {"lines": lines[name], "statements": statements[name]} for name in FOLDERS}

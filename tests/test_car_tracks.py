@@ -126,8 +126,7 @@ def test_a_laser_beside_the_camera_locates_the_same_cars(at):
 
 def test_what_hides_from_the_other_point_is_left_out_of_a_scan():
     angle = np.radians(np.arange(-60.0, 60.5, 0.5))
-    distance = np.where(np.abs(angle) < math.radians(10.0), 3.0, 10.0)
-    scan = RangeScan(0.0, 0.0, angle, distance, 40.0)
+    scan = RangeScan(0.0, 0.0, angle, np.where(np.abs(angle) < math.radians(10.0), 3.0, 10.0), 40.0)
     assert scan.seen_from(0.0, 0.0) is scan
     moved = scan.seen_from(0.0, 1.0)  # from the left, the post hides more on its right
     assert (np.diff(moved.angle) >= 0.0).all()

@@ -78,8 +78,7 @@ def test_an_option_means_the_same_everywhere():
 
 @pytest.mark.parametrize("entry", [entry for entry in LISTED.values() if entry.source])
 def test_a_number_out_of_its_range_is_refused_by_every_command(entry):
-    command = command_class(entry.source)
-    for option in field_options(command):
+    for option in field_options(command_class(entry.source)):
         if any(field.is_required() for field in option.model.model_fields.values()):
             continue  # what is missing is said first
         bounds = [mark.ge for mark in option.field.metadata if isinstance(mark, Ge)]
@@ -210,8 +209,7 @@ def failing(error):
 def test_an_unforeseen_error_is_one_line_and_a_file(monkeypatch, error):
     monkeypatch.setattr("parkenv.lots.load_lot", failing(error))
     ended = parkenv("lot", "show", "mini")
-    assert ended.returncode == 70
-    assert ended.stderr.count("\n") == 1
+    assert (ended.returncode, ended.stderr.count("\n")) == (70, 1)
     told = rf"parkenv: error: unforeseen {type(error).__name__}: .*report it with (\S+\.txt)\n"
     found = re.search(told, ended.stderr)
     assert "in fail" in Path(found[1]).read_text()

@@ -146,8 +146,7 @@ def test_differences_are_paired_by_seed_and_one_value_has_no_interval():
 )
 def test_an_agent_is_called_the_fastest_only_where_no_interval_includes_0(n, slower_s, leaders):
     """The oracle, which is faster than all, is no competitor; two searches show nothing, however they end."""
-    rng = np.random.default_rng(1)
-    scenario, noise = make_scenario("mini"), rng.normal(0.0, 5.0, n)
+    scenario, noise = make_scenario("mini"), np.random.default_rng(1).normal(0.0, 5.0, n)
     cases = [Case(scenario, name) for name in ("mdp", "belief", "oracle")]
     later = {"mdp": np.zeros(n), "belief": slower_s + noise - noise.mean(), "oracle": np.full(n, -20.0)}
     finished = {case.key(s): episode(s, 100.0 + s + later[case.agent][s]) for case in cases for s in range(n)}
@@ -192,8 +191,7 @@ def test_going_on_notices_that_an_agent_of_your_own_has_changed(tmp_path):
     module, out = tmp_path / "mine.py", tmp_path / "out"
     module.write_text("from planners.heuristics.agents import GreedyGoalAgent as Mine\n")
     ran(*small(out, agents="mine:Mine"), cwd=tmp_path)
-    others = small(out, "--resume", agents="mdp", episodes=3)
-    ran(*others, cwd=tmp_path)
+    ran(*small(out, "--resume", agents="mdp", episodes=3), cwd=tmp_path)
     ran(*small(out, "--resume", agents="mine:Mine", episodes=14), cwd=tmp_path)
     module.write_text("from planners.heuristics.agents import RandomAgent as Mine\n")
     said = refused(*small(out, "--resume", agents="mine:Mine", episodes=16), cwd=tmp_path)

@@ -164,8 +164,7 @@ def test_without_a_home_code_is_kept_in_a_temporary_folder(monkeypatch, tmp_path
 def test_code_is_kept_in_the_users_folder_unless_another_is_named(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_folder().name == "compiled"
-    assert cache_folder().parent.name == "parkenv"
+    assert (cache_folder().name, cache_folder().parent.name) == ("compiled", "parkenv")
     assert sys.platform != "linux" or cache_folder().is_relative_to(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "mine"))
     assert cache_folder() == tmp_path / "mine"
@@ -193,8 +192,7 @@ def test_seconds_of_compiling_and_loading_are_counted_and_no_others(caller, monk
     assert seconds_spent() - before > compiling
     assert sum(COMPILES in message for message in caplog.messages) == 1, "one line in a process"
 
-    again = importlib.reload(caller)
-    before = seconds_spent()
+    again, before = importlib.reload(caller), seconds_spent()
     again.g(1.0)
     assert 0.0 < seconds_spent() - before < compiling, "loading is counted, and takes less"
 

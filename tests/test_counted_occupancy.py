@@ -97,8 +97,7 @@ def test_searches_meet_the_counted_days():
     occupancy = counted(attraction=np.linspace(1.6, -1.6, lot.n_slots))
     scenario = make_scenario("campus", occupancy=occupancy)
     env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
-    batch = ParkSearchVectorEnv(6, scenario)
-    together, _ = batch.reset(seed=0)
+    together, _ = ParkSearchVectorEnv(6, scenario).reset(seed=0)
     days = set()
     for seed in range(6):
         observation, _ = env.reset(seed=seed)
@@ -165,8 +164,7 @@ def test_what_counts_cannot_do_is_refused(tmp_path, options, message):
 
 
 def test_a_saturday_as_usual_needs_times_free_places_and_their_number_only(tmp_path):
-    table = tmp_path / "export.csv"
-    begin = datetime(2024, 5, 1)
+    table, begin = tmp_path / "export.csv", datetime(2024, 5, 1)
     hours = [begin + timedelta(hours=h) for h in range(24 * 28)]
     full = [0.9 if time.weekday() == 5 and 9 <= time.hour < 18 else 0.3 for time in hours]
     shares = zip(hours, full, strict=True)

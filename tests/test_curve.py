@@ -28,6 +28,7 @@ from parkenv.studies.curve.zones import LONE, OF_CARS, STATE, Hours, Places, Zon
 from parkenv.studies.fleet.day import Roads
 
 N_ZONES, N_HOURS, MULTIPLES, DAYS = 60, 4, (0.5, 1.0, 1.5, 2.0), 4
+WORDS = ("--agents", "greedy-drive", "--arrivals-per-hour", "30,80", "--bootstraps", 2, "--reach", 15)
 
 
 def search_law(occupancy, demand):
@@ -176,9 +177,6 @@ def test_curves_are_called_with_arrays_and_say_what_there_is_not():
         Curves({})
 
 
-WORDS = ("--agents", "greedy-drive", "--arrivals-per-hour", "30,80", "--bootstraps", 2, "--reach", 15)
-
-
 def test_the_command_writes_what_other_models_read(district, tmp_path):
     ran("curve", district, *WORDS, "-n", 2, "--jobs", 1, "--out", tmp_path / "a")
     assert (tmp_path / "a" / "curve.png").exists()
@@ -198,9 +196,8 @@ def test_the_command_writes_what_other_models_read(district, tmp_path):
     curves = parkenv.load_curves(tmp_path / "a")
     curve = curves.curves["district", "0", "all", "8"]  # its own demand is 70 cars an hour
     (row,) = (row for row in rows_in(tmp_path / "a" / "activitysim.csv") if row["zone_id"] == "0")
-    assert float(row["TERMINAL_AM"]) == pytest.approx(
-        (curve["search_s"][1] + curve["walk_s"][1]) / 60.0, abs=0.01
-    )
+    cost_min = (curve["search_s"][1] + curve["walk_s"][1]) / 60.0
+    assert float(row["TERMINAL_AM"]) == pytest.approx(cost_min, abs=0.01)
     both = ["shoppers", "visitors"]
     value, low, high = curves.search_s(occupancy=[0.2, 0.9], zone="0", hour=8, purpose=both)
     assert (low <= value).all()

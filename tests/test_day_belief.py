@@ -17,8 +17,7 @@ from parkenv.world.occupancy.day_error import DayError, nearness
 def forecast_of(n, seed=0, level=0.8, slope=0.0, decay_rate=0.0, least=0.3):
     """Forecast of at least `least`, nearness, and belief before any observation."""
     rng = np.random.default_rng(seed)
-    near = nearness(rng.uniform(10.0, 90.0, n))
-    p = rng.uniform(least, 0.95, n)
+    near, p = nearness(rng.uniform(10.0, 90.0, n)), rng.uniform(least, 0.95, n)
     return p, near, SlotBelief.of_forecast(p, np.full(n, decay_rate), (level, slope))
 
 

@@ -55,14 +55,11 @@ def test_nothing_of_a_day_or_later_ones_reaches_its_forecast(trained):
     changed = few.occupied.copy()
     changed[:, 50:] = 1.0 - changed[:, 50:]
     two = few, with_values(few, changed)
-    fitted = fit_settings(few, 50)
-    assert fitted == fit_settings(two[1], 50) != CurveSettings()
-    old, new = (
-        [(m.forecast.occupancy, m.forecast.covariance) for m in compare(c, 40, CurveSettings())] for c in two
-    )
-    for theirs, same in zip(old, new, strict=True):
-        for a, b in zip(theirs, same, strict=True):
-            np.testing.assert_array_equal(a[:, :11], b[:, :11])
+    assert fit_settings(few, 50) == fit_settings(two[1], 50) != CurveSettings()
+    old, new = ([m.forecast for m in compare(c, 40, CurveSettings())] for c in two)
+    for a, b in zip(old, new, strict=True):
+        np.testing.assert_array_equal(a.occupancy[:, :11], b.occupancy[:, :11])
+        np.testing.assert_array_equal(a.covariance[:, :11], b.covariance[:, :11])
 
 
 def test_past_learns_nothing_after_its_date_and_says_so():
@@ -111,16 +108,13 @@ def test_a_holiday_is_known_from_the_year_before():
 def test_the_day_so_far_tells_of_its_rest(trained):
     """Days differ in their level alone here, so that the morning says nearly all."""
     counts, _, forecast = trained
-    days = slice(60, 140)
-    late = forecast.from_day(60)
-    given = late.given(counts, 9)
-    observed = counts.occupied[:, days]
+    days, late = slice(60, 140), forecast.from_day(60)
+    given, observed = late.given(counts, 9), counts.occupied[:, days]
     np.testing.assert_allclose(given.occupancy[:, :, :9], observed[:, :, :9], atol=0.01)
     before, after = (np.abs(f.occupancy - observed)[:, :, 9:].mean() for f in (late, given))
     assert after < 0.5 * before
     assert (given.sd[:, :, 9:] < 0.85 * late.sd[:, :, 9:]).all()
-    none = late.given(counts, 0)
-    np.testing.assert_allclose(none.mean, late.mean)
+    np.testing.assert_allclose(late.given(counts, 0).mean, late.mean)
 
 
 def test_gaps_and_car_parks_without_readings_do_no_harm():
@@ -140,8 +134,7 @@ def test_gaps_and_car_parks_without_readings_do_no_harm():
 def test_one_full_or_empty_car_park_is_no_trouble():
     counts, _ = car_parks(2, 60)
     for value in (0.0, 1.0):
-        flat = with_values(counts, np.full_like(counts.occupied, value))
-        forecast = forecast_days(flat, 30)
+        forecast = forecast_days(with_values(counts, np.full_like(counts.occupied, value)), 30)
         assert np.abs(forecast.occupancy - value).max() < 0.05
 
 
@@ -168,8 +161,7 @@ def test_our_model_is_ahead_of_every_baseline():
 
 def test_the_score_of_a_sample_is_that_of_its_definition():
     rng = np.random.default_rng(1)
-    values = np.sort(rng.normal(size=(9, 5)), axis=0)
-    y = rng.normal(size=5)
+    values, y = np.sort(rng.normal(size=(9, 5)), axis=0), rng.normal(size=5)
     grid = np.linspace(-8, 8, 40_001)
     below = (values[:, :, None] <= grid).mean(axis=0)
     expected = ((below - (y[:, None] <= grid)) ** 2).sum(axis=1) * (grid[1] - grid[0])

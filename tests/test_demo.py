@@ -34,8 +34,7 @@ def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     assert (out / "search.gif").stat().st_size < 3e6
 
     # The oracle needs no sensors.
-    spec = Demo(scenario=scenario_spec("mini"), sessions=2, episodes=2, every=8.0)
-    cases = spec.cases_in(out)
+    cases = Demo(scenario=scenario_spec("mini"), sessions=2, episodes=2, every=8.0).cases_in(out)
     (oracle,) = [case for case, _ in cases if case.agent == "oracle"]
     seed = cases[0][1][0]
     looking = Case(oracle.scenario, "oracle", rig="laser").runner().run(seed).row

@@ -129,8 +129,7 @@ def test_slots_follow_the_cars_and_never_overlap(seed, turn, noise):
 @pytest.mark.parametrize("name", ["campus", "street"])
 def test_a_packaged_lot_is_found_from_its_cars(name, tmp_path):
     lot, rng = packaged_lot(name), np.random.default_rng(1)
-    track = np.asarray(survey_route(lot).path)[:, :2]
-    drives = []
+    track, drives = np.asarray(survey_route(lot).path)[:, :2], []
     for _ in range(3):
         taken = np.flatnonzero(rng.random(lot.n_slots) < 0.6)
         noisy = lot.slot_xy[taken] + 0.2 * rng.standard_normal((len(taken), 2))
@@ -156,8 +155,7 @@ def test_real_cars_are_found_where_they_park(name, gaps):
     away = np.hypot(*(xy["slots"][:, None] - lot.slot_xy[None]).transpose(2, 0, 1))
     assert (away[is_taken][:, found.source == CAR].min(axis=1) <= 0.6).mean() >= 0.95
     assert (away[~is_taken].min(axis=1) <= 2.0).sum() >= min(gaps, (~is_taken).sum())
-    turns = np.abs((lot.slot_yaw - yaw + math.pi / 2) % math.pi - math.pi / 2)
-    assert np.median(turns) < 0.08
+    assert np.median(np.abs((lot.slot_yaw - yaw + math.pi / 2) % math.pi - math.pi / 2)) < 0.08
 
 
 def test_a_street_that_is_driven_to_and_fro_is_one_lane_between_both():

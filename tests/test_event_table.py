@@ -137,8 +137,7 @@ def test_counts_of_kerbs_are_followed_at_their_own_rate(tmp_path):
 
 def test_counts_in_several_columns_and_without_capacities(tmp_path):
     text = f"round,block,green,red\n{DAY} 08:00,a,2,1\n{DAY} 09:00,a,,4\n{DAY} 10:00,a,,\n"
-    path = table(tmp_path, text)
-    counts = Counts.read(path, capacity="largest", columns="taken=green+red")
+    counts = Counts.read(table(tmp_path, text), capacity="largest", columns="taken=green+red")
     np.testing.assert_allclose(counts.occupied[0, 0, 8:11], [0.75, 1.0, np.nan])
 
 
@@ -170,8 +169,7 @@ def test_kerbs_of_a_lot_follow_their_own_counts(tmp_path):
     arrival = Arrival(1 * DAY_S + 8 * HOUR_S, "2024-05-07")
     world, forecast = scenario.occupancy.world(0, arrival), scenario.forecast(arrival).p_occupied
     for minute in range(0, 300, 5):
-        taken = world.occupied([0, 1], arrival.time + 60.0 * minute)
-        assert taken.sum() == (480 + minute) % 3
+        assert world.occupied([0, 1], arrival.time + 60.0 * minute).sum() == (480 + minute) % 3
     assert forecast[2:] == pytest.approx(forecast[:2].mean())
     occupancy["counts"]["columns"] = "time_utc=time"
     with pytest.raises(InputError, match=r"counts\.csv: has times in UTC or with an offset, want --timezone"):

@@ -117,8 +117,7 @@ def test_agents_with_options_are_read_from_words_and_tables():
 def test_a_grid_without_bounds_is_refused_before_any_work(tmp_path):
     axis = list(range(1, 1001))
     speeds = f"v_walk_kmh = {[v / 10 for v in axis]}\nv_drive_kmh = {[v / 5 for v in axis]}"
-    text = f"episodes = 1\n[grid]\nfailure_s = {axis}\n{speeds}"
-    said = refusal(tmp_path, text)
+    said = refusal(tmp_path, f"episodes = 1\n[grid]\nfailure_s = {axis}\n{speeds}")
     assert "agents x scenarios x grid x episodes is 8000000000 searches, want at most" in said
 
 

@@ -161,8 +161,7 @@ def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_pat
     rows = {case.agent: case.run(seeds) for case, seeds in cases}
     episodes = {EPISODES.key(row): row for its in rows.values() for row in its}
     table = [{**row(case.agent), "scenario": "mini"} for case, _ in cases]
-    results = ComparisonResults(cases, episodes, table)
-    files = draw_figures(results, tmp_path)
+    files = draw_figures(ComparisonResults(cases, episodes, table), tmp_path)
     assert sorted(files) == sorted(tmp_path.iterdir())
     drawn = {name for name in FIGURES if any(file.name.startswith(name) for file in files)}
     of_sweeps = {f"time_against_{what}" for what in ("failure_cost", "map")}

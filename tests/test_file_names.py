@@ -85,8 +85,7 @@ def test_a_name_that_a_terminal_would_obey_is_refused(tmp_path, name):
 
 
 def test_a_path_that_a_terminal_would_obey_is_printed_escaped(tmp_path):
-    path = lot_named("plain", tmp_path / "\x1b[31mred\u202e.geojson")
-    checked = parkenv("lot", "check", path)
+    checked = parkenv("lot", "check", lot_named("plain", tmp_path / "\x1b[31mred\u202e.geojson"))
     assert (checked.returncode, checked.stderr) == (0, "")
     assert r"\x1b[31mred\u202e.geojson" in checked.stdout
     assert checked.stdout.replace("\n", "").isprintable()

@@ -59,8 +59,7 @@ def written(write, suffix=""):
 
 
 def lot(path):
-    problems = check_lot(path)
-    assert all("\n" not in p.message for p in problems)
+    assert all("\n" not in p.message for p in check_lot(path))
     write_lot(read_lot(path), path.with_name("copy.geojson"))
 
 
@@ -100,8 +99,7 @@ def resumed(path):
 
 
 def reported(path):
-    run = RunFolder.read(path.parent)
-    write_page(run.data(), path.with_name("report.html"))
+    write_page(RunFolder.read(path.parent).data(), path.with_name("report.html"))
 
 
 def reported_kind(path):

@@ -38,8 +38,7 @@ def game(tmp_path_factory):
 @pytest.fixture(scope="module")
 def scores(game, tmp_path_factory):
     """What the page would save if a person did what the agent `belief` does."""
-    data = data_of(game, "game-data")
-    worlds = []
+    data, worlds = data_of(game, "game-data"), []
     for world in data["worlds"]:
         env = gym.make("parkenv/Search-v2", scenario="mini")
         env.reset(seed=world["seed"])
@@ -175,6 +174,5 @@ def test_the_page_searches_as_python_does(browser, game):
     seeds = [world["seed"] for world in data_of(game, "game-data")["worlds"]]
     searches = random_searches(make_scenario("mini"), seeds)
     program = "return arguments[0].map(([w, actions]) => game.take(w, actions))"
-    taken = browser.execute_script(program, [[w, its[0]] for w, its in searches])
-    require_equal(searches, taken)
+    require_equal(searches, browser.execute_script(program, [[w, its[0]] for w, its in searches]))
     assert browser.get_log("browser") == []

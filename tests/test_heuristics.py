@@ -213,8 +213,7 @@ def test_a_compiled_policy_decides_as_its_agent_in_every_situation(name):
 
 def test_a_policy_takes_the_options_of_its_agent():
     scenario = parkenv.make_scenario("campus")
-    agent = make_agent("first-free", scenario, within_m=150.0)
-    slots = []
+    agent, slots = make_agent("first-free", scenario, within_m=150.0), []
     for kind, agents in ((DriverKind(policy=agent.compiled_policy()), None), (DriverKind(), [agent])):
         fleet = Fleet(scenario, Demand(Headways(20, 30.0)), drivers=[kind])
         slots.append(driven(fleet, 3, agents=agents).cars["slot"].tolist())

@@ -18,8 +18,7 @@ def plain_histograms(image):
     for y in range(rows * CELL):
         row = (y + 0.5) / CELL - 0.5
         for x in range(columns * CELL):
-            column = (x + 0.5) / CELL - 0.5
-            k = int(np.floor(place[y, x]))
+            column, k = (x + 0.5) / CELL - 0.5, int(np.floor(place[y, x]))
             for dk, wk in ((0, 1 - (place[y, x] - k)), (1, place[y, x] - k)):
                 for dr, wr in ((0, 1 - (row - np.floor(row))), (1, row - np.floor(row))):
                     for dc, wc in ((0, 1 - (column - np.floor(column))), (1, column - np.floor(column))):

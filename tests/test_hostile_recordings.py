@@ -42,8 +42,7 @@ def bag(folder, plugin="MCAP", mode="STORAGE", size=LARGE, stamps=(1,)):
 
 
 def bag_of_ros1(file, compression):
-    store = get_typestore(Stores.ROS1_NOETIC)
-    writer = WriterOfRos1(file)
+    store, writer = get_typestore(Stores.ROS1_NOETIC), WriterOfRos1(file)
     writer.set_compression(WriterOfRos1.CompressionFormat[compression])
     with writer:
         camera = writer.add_connection("/camera", KIND, typestore=store)

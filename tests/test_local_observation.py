@@ -38,8 +38,7 @@ def test_every_number_is_what_the_table_says(name):
     rng = np.random.default_rng(2)
     for seed in range(3):
         observation, _ = env.reset(seed=seed)
-        before = env.unwrapped.state.vertex
-        first_looks = {}
+        before, first_looks = env.unwrapped.state.vertex, {}
         for _ in range(25):
             state, local = env.unwrapped.state, observation["local"]
             v, belief = state.vertex, state.belief
@@ -103,8 +102,7 @@ def test_what_lies_ahead_is_told_move_by_move():
         v = env.unwrapped.state.vertex
         for move in np.flatnonzero(observation["action_mask"][:PARK]):
             block = observation["local"][HERE + PER_MOVE * move :][:PER_MOVE]
-            to = int(lot.neighbors[v, move])
-            east = lot.vertex_xy[to, 0] - lot.vertex_xy[v, 0]
+            east = lot.vertex_xy[int(lot.neighbors[v, move]), 0] - lot.vertex_xy[v, 0]
             xs = lot.vertex_xy[:12, 0]
             ahead = np.flatnonzero((xs - lot.vertex_xy[v, 0]) * np.sign(east) > 1e-6)
             if len(ahead) >= K and len(set(taken[ahead])) == 1:
@@ -118,8 +116,7 @@ def test_what_lies_ahead_is_told_move_by_move():
 def test_the_best_free_slot_is_remembered_until_it_is_seen_taken():
     scenario = make_scenario("street")
     env = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario), K)
-    rng = np.random.default_rng(0)
-    remembered = 0
+    rng, remembered = np.random.default_rng(0), 0
     for seed in range(5):
         observation, _ = env.reset(seed=seed)
         np.testing.assert_array_equal(observation["local"][11:14], [0.0, 1.0, 1.0])

@@ -86,8 +86,7 @@ def test_people_and_traffic_are_not_parked_cars_nor_are_those_that_left_during_t
 
 
 def test_unseen_slots_stay_unknown_and_a_detection_goes_to_its_slot_alone(mini):
-    slots = SlotFilter(mini)
-    pose = np.array([*mini.vertex_xy[0], 0.0])
+    slots, pose = SlotFilter(mini), np.array([*mini.vertex_xy[0], 0.0])
     wall = np.full(LASER.n_beams, 0.5, np.float32)
     slots.update_from_scan(scan_from_laser(LASER, MOUNT, pose, wall))
     states = slots.states()
@@ -132,8 +131,7 @@ def test_few_sessions_are_unsure_many_are_sharp_and_a_slot_that_was_never_seen_i
     assert b.p_occupied[0] > 0.9 > 0.7 > a.p_occupied[0]
     known = np.ones((20, 3), bool)
     known[:, 2] = False
-    log = sessions(np.zeros(20), [[1, 1, 0]] * 20, known)
-    found = predict(log)
+    found = predict(sessions(np.zeros(20), [[1, 1, 0]] * 20, known))
     assert found.p_occupied[2] > 0.8
     assert found.sessions.tolist() == [20, 20, 0]
     assert found.high[2] - found.low[2] > found.high[0] - found.low[0]
@@ -142,15 +140,12 @@ def test_few_sessions_are_unsure_many_are_sharp_and_a_slot_that_was_never_seen_i
 def test_intervals_hold_the_truth_as_often_as_they_say():
     rng = np.random.default_rng(0)
     true = rng.beta(4, 4, 400)
-    log = sessions(np.zeros(12), rng.random((12, 400)) < true)
-    found = predict(log, 0.0)
-    inside = ((found.low <= true) & (true <= found.high)).mean()
-    assert 0.8 < inside <= 1.0
+    found = predict(sessions(np.zeros(12), rng.random((12, 400)) < true), 0.0)
+    assert 0.8 < ((found.low <= true) & (true <= found.high)).mean() <= 1.0
 
 
 def test_a_map_is_a_prior_of_a_search():
-    lot = make_scenario("mini").lot
-    log = sessions([40_000.0] * 9, [np.arange(lot.n_slots) % 2 == 0] * 9)
+    log = sessions([40_000.0] * 9, [np.arange(make_scenario("mini").lot.n_slots) % 2 == 0] * 9)
     scenario = make_scenario("mini", prior=MapPrior(log))
     p = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=0)[0]["p_occupied"]
     assert p[::2].min() > p[1::2].max()
@@ -284,8 +279,7 @@ def test_two_processes_write_at_once_and_a_kill_leaves_whole_sessions_only(mini,
 
 
 def test_slots_are_found_where_cars_stand_again_and_again():
-    lot = packaged_lot("campus")
-    rng = np.random.default_rng(3)
+    lot, rng = packaged_lot("campus"), np.random.default_rng(3)
     seen = []
     for _ in range(20):
         taken = np.flatnonzero(rng.random(lot.n_slots) < 0.6)
@@ -293,8 +287,7 @@ def test_slots_are_found_where_cars_stand_again_and_again():
         turned = lot.slot_yaw[taken] + rng.normal(0, 0.05, n) + np.pi * rng.integers(0, 2, n)
         seen.append(np.column_stack([lot.slot_xy[taken] + rng.normal(0, 0.2, (n, 2)), turned]))
     passing = np.column_stack([rng.uniform(0, 100, (30, 2)), rng.uniform(0, 3, 30)])
-    found = discover(np.concatenate([*seen, passing]))
-    score = score_discovery(found, lot)
+    score = score_discovery(discover(np.concatenate([*seen, passing])), lot)
     assert min(score.recall, score.precision) > 0.98
     assert score.error < 0.25
     assert len(discover(np.empty((0, 3))).xy) == 0
@@ -306,8 +299,7 @@ def test_pose_errors_are_as_large_as_stated_and_grow_along_the_way():
     assert error[:, 0].std() == pytest.approx(0.5, rel=0.25)
     assert error[:, 2].std() == pytest.approx(0.02, rel=0.25)
     near = np.corrcoef(error[:-1, 0], error[1:, 0])[0, 1]
-    far = np.corrcoef(error[:-300, 0], error[300:, 0])[0, 1]
-    assert near > 0.9 > 0.4 > abs(far)
+    assert near > 0.9 > 0.4 > abs(np.corrcoef(error[:-300, 0], error[300:, 0])[0, 1])
     np.testing.assert_array_equal(PoseNoise().estimated(path, np.random.default_rng(0)), path)
 
 

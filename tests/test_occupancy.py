@@ -151,8 +151,7 @@ def test_at_mean_occupancy_hits_its_target_and_keeps_the_order_of_slots(target):
 
 
 def test_a_file_gives_the_same_process_back(tmp_path):
-    path = tmp_path / "process.json"
-    process = busy_process()
+    path, process = tmp_path / "process.json", busy_process()
     process.to_file(path)
     assert np.array_equal(OccupancyProcess.from_file(path).factors, process.factors)
     assert np.array_equal(OccupancyProcess.from_file(path).profiles, process.profiles)

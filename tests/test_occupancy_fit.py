@@ -28,8 +28,7 @@ FIRST_MONDAY = np.datetime64("2024-01-01")
 
 def simulated_log(process, n_weeks, every_s, start_h=7, end_h=19, seed=0):
     """Log of a camera that observes all slots at the same times every day."""
-    n = process.n_slots
-    world = process.world(world_key(seed, 0), Arrival(0.0))
+    n, world = process.n_slots, process.world(world_key(seed, 0), Arrival(0.0))
     seconds = np.arange(start_h * HOUR_S, end_h * HOUR_S, every_s)
     times = (np.arange(7 * n_weeks)[:, None] * DAY_S + seconds).ravel()
     states = np.array([world.occupied(np.arange(n), time) for time in times])
@@ -97,8 +96,7 @@ def test_intervals_are_split_exactly_at_full_hours():
 def hourly():
     """A process with a morning rush, quiet weekends and uneven slots; its fit from observations every half hour."""
     rng = np.random.default_rng(5)
-    hour = np.arange(24)
-    weekday = 1e-4 * np.exp(2 * np.exp(-(((hour - 9) / 2) ** 2)))
+    weekday = 1e-4 * np.exp(2 * np.exp(-(((np.arange(24) - 9) / 2) ** 2)))
     profile = np.concatenate([np.tile(weekday, 5), np.tile(0.3 * weekday, 2)])
     factors = np.exp(rng.normal(0, 0.7, (2, 40)))
     factors /= np.exp(np.log(factors).mean(axis=1, keepdims=True))

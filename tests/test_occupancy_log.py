@@ -32,8 +32,7 @@ def write(tmp_path, text, name="log.csv"):
 
 def random_log(n_slots=4, days=(*MONDAYS, *SATURDAYS), seed=0, change_days=()):
     """Observations every half hour from 7 to 19; slot s is taken with the probability (s + 1) / (n + 1)."""
-    rng = np.random.default_rng(seed)
-    days = tuple(sorted(days))
+    rng, days = np.random.default_rng(seed), tuple(sorted(days))
     grid = np.meshgrid(range(n_slots), range(len(days)), range(24), indexing="ij")
     slot, day, step = (a.ravel() for a in grid)
     occupied = rng.random(slot.size) < (slot + 1) / (n_slots + 1)
@@ -79,8 +78,7 @@ def test_several_logs_are_one_by_date(tmp_path):
 
 def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tmp_path):
     text = "slot_id,occupied,datetime\na,1,2024-01-01 07:00\na,0,2024-01-01 07:00\na,0,2024-01-01 08:00\n"
-    log = OccupancyLog.read(write(tmp_path, text))
-    assert log.occupied.tolist() == [False, False]
+    assert OccupancyLog.read(write(tmp_path, text)).occupied.tolist() == [False, False]
 
 
 def replay_of(seconds, states):
@@ -131,8 +129,7 @@ def test_mean_occupancy_weighs_time_between_the_first_and_the_last_look():
 
 
 def test_the_fullest_log_slots_stand_nearest_to_the_goal():
-    log = random_log(n_slots=8)
-    walk = np.array([30.0, 10.0, 20.0, 40.0])
+    log, walk = random_log(n_slots=8), np.array([30.0, 10.0, 20.0, 40.0])
     arrival = at(MONDAYS[0], 9)
     fullest_first = np.argsort(-log.mean_occupancy("weekday", days=np.array(log.days) != MONDAYS[0]))
     world = RecordedOccupancy(log, walk).world(0, arrival)
@@ -260,8 +257,7 @@ def real_log():
 
 
 def test_the_real_log_shows_the_morning_fill_up(real_log):
-    assert len(real_log.slot_ids) == 164
-    assert len(real_log.days) == 15
+    assert (len(real_log.slot_ids), len(real_log.days)) == (164, 15)
     assert real_log.recorded.all()
     by_hour = [np.nanmean(real_log.mean_occupancy("weekday", (hour, hour + 1))) for hour in range(7, 12)]
     assert by_hour[0] < 0.12

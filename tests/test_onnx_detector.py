@@ -36,8 +36,7 @@ FILE = MODELS / "net.onnx"
 
 
 def photo(width=90, height=50, seed=0):
-    rng = np.random.default_rng(seed)
-    small = rng.integers(0, 256, (5, 9, 3), dtype=np.uint8)
+    small = np.random.default_rng(seed).integers(0, 256, (5, 9, 3), dtype=np.uint8)
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
@@ -108,8 +107,7 @@ def test_boxes_are_those_of_a_plain_decoding(tmp_path, channels, settings, thres
 
 
 def test_a_grey_image_is_one_of_three_equal_channels_and_bgr_is_the_reverse(tmp_path):
-    file = Tiny().save(tmp_path / "a.onnx")
-    grey = photo()[..., 0]
+    file, grey = Tiny().save(tmp_path / "a.onnx"), photo()[..., 0]
     seen, as_color = (make_detector(file).detect(i) for i in (grey, np.dstack([grey] * 3)))
     np.testing.assert_array_equal(seen.boxes, as_color.boxes)
     rgb = make_detector(file).detect(photo())
@@ -120,8 +118,7 @@ def test_a_grey_image_is_one_of_three_equal_channels_and_bgr_is_the_reverse(tmp_
 
 def test_a_detector_is_copied_and_equal_runs_are_equal_on_any_number_of_threads(tmp_path):
     detector = make_detector(Tiny().save(tmp_path / "a.onnx"))
-    first = detector.detect(photo())
-    threads = cv2.getNumThreads()
+    first, threads = detector.detect(photo()), cv2.getNumThreads()
     try:
         for again, count in ((pickle.loads(pickle.dumps(detector)), 1), (copy.deepcopy(detector), 4)):
             cv2.setNumThreads(count)
@@ -223,8 +220,7 @@ def test_numbers_that_are_no_scores_are_refused(tmp_path, last, message):
 
 @pytest.mark.parametrize(("classes", "cars"), [(1, [0]), (80, [2, 5, 7])])
 def test_the_only_class_and_those_of_coco_are_known(tmp_path, classes, cars):
-    file = Tiny(classes).save(tmp_path / "a.onnx")
-    found = []
+    file, found = Tiny(classes).save(tmp_path / "a.onnx"), []
     for line in ("", f"cars = {cars}\n"):
         (tmp_path / "a.toml").write_text(f"size = [64, 64]\n{line}")
         found.append(make_detector(file).detect(photo()).boxes)
@@ -294,8 +290,7 @@ def test_specifications_name_detectors(tmp_path):
 
 @pytest.mark.slow
 def test_a_network_looks_in_worker_processes_too(tmp_path):
-    file = Tiny().save(tmp_path / "a.onnx")
-    totals = []
+    file, totals = Tiny().save(tmp_path / "a.onnx"), []
     for jobs in (2, 1):
         out = tmp_path / str(jobs)
         words = "compare --scenario mini --agents first-free -n 2 --occupancy-levels none --no-figures --rig laser"
@@ -376,8 +371,7 @@ def test_it_finds_the_cars_of_a_picture_with_windows_around_them_and_a_copy_the_
         if view != View.OBLIQUE:
             assert sure.view[best] == view
             assert sure.end_on[best] == (view == View.END)
-    side = ~found.end_on
-    size = found.regions[:, 2:] - found.regions[:, :2]
+    side, size = ~found.end_on, found.regions[:, 2:] - found.regions[:, :2]
     side |= found.boxes[:, 2] - found.boxes[:, 0] > 2.0 * (found.boxes[:, 3] - found.boxes[:, 1])
     assert size[side, 0] == pytest.approx(2.5 * size[side, 1], rel=1e-4)
     assert size[~side, 0] == pytest.approx(size[~side, 1], rel=1e-4)
@@ -408,8 +402,7 @@ def test_grey_pictures_and_other_sizes(net, street):
 
 
 def test_centers_are_decoded_cell_by_cell():
-    rng = np.random.default_rng(0)
-    cells = rng.uniform(0.0, 1.0, (1, 9, 12, 16)).astype(np.float32)
+    cells = np.random.default_rng(0).uniform(0.0, 1.0, (1, 9, 12, 16)).astype(np.float32)
     cells[0, 1:5] *= 40.0
     cells[0, 0, 3:5, 3:6] = 0.99  # equal neighbours: one car
     found = decode_centers(cells, (128, 96), 0.2)

@@ -60,8 +60,7 @@ def test_a_survey_with_a_detector_of_ones_own_beats_chance_and_is_not_hog():
 
 
 def test_the_environment_observes_slots_with_it():
-    scenario = make_scenario("mini")
-    seen = {}
+    scenario, seen = make_scenario("mini"), {}
     for detector in ("hog", OWN, make_detector(OWN)):
         options = {"scenario": scenario, "weather": "overcast", "detector": detector}
         env = gym.make("parkenv/SearchPerception-v2", **options)

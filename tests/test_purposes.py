@@ -137,8 +137,7 @@ TABLES = {
 def test_a_scenario_file_has_purposes():
     demand = make_scenario(ScenarioSpec.parse(TABLES, "town.toml")).demand
     assert [one.name for one in demand.purposes] == ["shoppers", "staff"]
-    assert demand.expected == 66.0
-    assert demand.scaled(2.0).expected == 132.0
+    assert (demand.expected, demand.scaled(2.0).expected) == (66.0, 132.0)
     shoppers, staff = demand.purposes
     assert staff.stay == LogNormalTime(28800.0, 0.2)
     assert staff.parked == 2
@@ -237,12 +236,10 @@ def test_a_parked_car_passes_no_garage_that_has_room():
     mini = make_scenario("mini")
     at = mini.lot.goals[0]
     lot = dataclasses.replace(mini.lot, facilities=(Facility("P", "garage", capacity=40, xy=tuple(at)),))
-    its = make_scenario(lot)
-    goals = (1.0,) * len(lot.goals)
+    its, goals = make_scenario(lot), (1.0,) * len(lot.goals)
     fleet = Fleet(its, Demand(Headways(1), ConstantTime(3600.0), parked=30, goal_weights=goals))
     fleet.reset(0)
-    garage = int(np.flatnonzero(lot.is_counted)[0])
-    walk_s = its.at_goal(0).walk_s
+    garage, walk_s = int(np.flatnonzero(lot.is_counted)[0]), its.at_goal(0).walk_s
     parked_at = fleet.cars["parked_at"][fleet.cars["parked_at"] >= 0]
     assert (walk_s[parked_at] <= walk_s[garage]).all()
     assert np.count_nonzero(parked_at == garage) >= 20
@@ -271,8 +268,7 @@ def test_a_lot_that_stays_as_full_needs_the_cars_that_leave():
 
 def test_the_course_of_a_process_is_the_mean_of_its_worlds():
     process = process_of_curve(np.linspace(-1.0, 1.0, 40), 0.5 + 0.3 * np.sin(np.arange(24.0)), 5400.0)
-    process = process.with_day_error(DayError(0.7))
-    arrival = Arrival(TIMES[0])
+    process, arrival = process.with_day_error(DayError(0.7)), Arrival(TIMES[0])
     exact, mean = (kind.course(process, arrival, TIMES[::12]) for kind in (OccupancyProcess, OccupancyModel))
     assert exact.residents[0] == exact.occupied[0]
     np.testing.assert_allclose(mean, exact, atol=0.05)
@@ -325,8 +321,7 @@ def test_each_recorded_day_is_followed_for_itself():
 
 
 def test_worlds_of_a_key_have_the_same_cars_and_more_come_if_more_are_wanted():
-    scenario = make_scenario("mini")
-    times = []
+    scenario, times = make_scenario("mini"), []
     for times_counted in (1.0, 1.0, 3.0):
         stay = ExponentialTime(1200.0)
         arrivals = FollowingArrivals(scenario.occupancy, scenario.arrival, stay, times_counted)

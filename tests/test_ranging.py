@@ -120,8 +120,7 @@ def test_a_neighbour_at_the_margin_does_not_count_and_a_run_goes_on_where_the_im
     short, whole = ranging.car_beams(scan, inside), ranging.car_beams(scan, inside, (True, True))
     assert set(short.beams) <= set(inside)
     assert set(short.run) == set(whole.beams), "the beams that go on beyond the box are known"
-    ends = scan.points(whole.beams[[0, -1]])[:, 0]
-    assert ends == pytest.approx([-2.2, 2.2], abs=0.05)
+    assert scan.points(whole.beams[[0, -1]])[:, 0] == pytest.approx([-2.2, 2.2], abs=0.05)
 
 
 def test_what_no_beam_meets_has_no_distance():
@@ -194,8 +193,7 @@ def test_a_car_goes_on_from_where_the_view_is_cut():
 @pytest.mark.parametrize("name", ["campus", "street"])
 def test_fitted_cars_stand_where_the_cars_do(name):
     """Along a survey of parked cars: heading and place of the fit beside those of the thesis's way (T §4.2)."""
-    lot = packaged_lot(name)
-    rng = np.random.default_rng(1)
+    lot, rng = packaged_lot(name), np.random.default_rng(1)
     scene = slot_lot(lot, 1).scene(rng.random(lot.n_slots) < 0.6)
     off = {ranging.localize_cars: [], ranging.localize_median: []}
     for pose in poses_along(survey_route(lot).path, 8.0):

@@ -33,8 +33,7 @@ def totals(scenario, agent, episodes):
 def test_the_world_is_the_log_and_the_forecast_is_not(scenario):
     """Searches fall on recorded weekdays in the window, with the occupancy of the log."""
     rows = Case(scenario, "greedy-drive").run(range(40))
-    days = set(scenario.occupancy.log.days)
-    assert {row["day"] for row in rows} <= days
+    assert {row["day"] for row in rows} <= set(scenario.occupancy.log.days)
     assert all(8 * 3600 <= row["arrival_s"] % 86400 < 13 * 3600 for row in rows)
     early = [row["occupancy"] for row in rows if row["arrival_s"] % 86400 < 9 * 3600]
     late = [row["occupancy"] for row in rows if row["arrival_s"] % 86400 > 11 * 3600]
@@ -48,8 +47,7 @@ def test_the_planner_beats_what_people_do_at_a_low_failure_cost_and_loses_its_le
     bold = totals(scenario.replace(failure_s=10.0), "mdp", episodes)
     careful = totals(scenario.replace(failure_s=90.0), "mdp", episodes)
     for strategy in ("greedy-goal", "greedy-drive", "first-free"):
-        theirs = totals(scenario, strategy, episodes)
-        _, low, _ = mean_interval(theirs - bold)
+        _, low, _ = mean_interval(totals(scenario, strategy, episodes) - bold)
         assert low > 0.0, f"{strategy} is not slower beyond doubt"
     _, low, _ = mean_interval(careful - bold)
     assert low > 0.0

@@ -38,8 +38,7 @@ def test_cars_that_stay_long_leave_later_than_the_counts_fall():
 def test_a_scenario_file_says_how_full(tmp_path):
     file = tmp_path / "half.toml"
     file.write_text('lot = "mini"\n[occupancy]\nreal_week = { fuller_than = 0.5 }\nday_error = 0.0\n')
-    made = make_scenario(file)
-    noon = 24 * 3600.0 + 12 * 3600.0
+    made, noon = make_scenario(file), 24 * 3600.0 + 12 * 3600.0
     assert made.occupancy.marginal(noon).mean() == pytest.approx(0.64, abs=1e-4)
     spec = ScenarioSpec.parse({"lot": "mini", "occupancy": "real-week"}, "test")
     assert spec.occupancy.real_week is not None
@@ -54,8 +53,7 @@ def test_slots_spread_as_in_the_recorded_log():
 def test_the_fit_finds_the_week_the_levels_and_the_days():
     rng = np.random.default_rng(0)
     days = tuple(date(2024, 1, 1) + timedelta(i) for i in range(210))
-    week = logit(OCCUPIED / 100.0).reshape(7, 24)
-    level = np.linspace(-1.0, 1.0, 9)
+    week, level = logit(OCCUPIED / 100.0).reshape(7, 24), np.linspace(-1.0, 1.0, 9)
     shift = rng.normal(0.0, 0.5, (9, len(days)))
     by_day = week[[day.weekday() for day in days]]
     occupied = expit(by_day + level[:, None, None] + shift[:, :, None])

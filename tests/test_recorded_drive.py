@@ -73,8 +73,7 @@ def bag(folder, poses=11, pictures=5, pose_type="nav_msgs/msg/Odometry", shift=(
         at = t["geometry_msgs/msg/Pose"](point, turned)
         if pose_type.endswith("PoseStamped"):
             return t[pose_type](header(stamp), at)
-        none = t["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-        zeros = np.zeros(36)
+        none, zeros = t["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(36)
         twist = t["geometry_msgs/msg/TwistWithCovariance"](t["geometry_msgs/msg/Twist"](none, none), zeros)
         return t[pose_type](header(stamp), "", t["geometry_msgs/msg/PoseWithCovariance"](at, zeros), twist)
 
@@ -375,8 +374,7 @@ def test_a_recorded_survey_gives_the_same_map_to_the_last_bit(tmp_path, rig, err
     done = ran("survey --sessions 1 --every 5 --jobs 1", *words, *driven)
     assert "--scenario mini" in " ".join(done.stdout.split())
     ran("map-drive", file, *words, "--out", tmp_path / "mapped")
-    lot = make_scenario("mini").lot
-    sessions = []
+    lot, sessions = make_scenario("mini").lot, []
     for folder in ("survey", "mapped"):
         with MapStore(tmp_path / folder / "map.sqlite", lot, create=False) as store:
             sessions += store.sessions()

@@ -43,8 +43,7 @@ def scene(roll=0.0, pitch=0.0, height=1.7):
     bridge = wall + np.array([0.0, 0.0, 5.0])
     points = np.vstack([road[road[:, 0] < 6.0], wall, bridge])
     # Pitched upwards, the vehicle sees what is ahead lower.
-    turn = Rotation.from_euler("ZYX", [0.0, -pitch, roll]).as_matrix()
-    return (points @ turn).astype(np.float32)
+    return (points @ Rotation.from_euler("ZYX", [0.0, -pitch, roll]).as_matrix()).astype(np.float32)
 
 
 def cloud(points, stamp=START, frame="lidar", kind="f4", order="<", offset=0, width=None):
@@ -154,8 +153,7 @@ def drive(skip=(), poses="fix", right_late=0, sides=("left",), lidar_roll=0.0, l
             )  # fmt: skip
         for i, side in enumerate(sides):
             at = late_ns + (right_late if side == "right" else 0)
-            grey = np.full(HEIGHT * WIDTH, k, np.uint8)
-            optical = f"{side}_optical"
+            grey, optical = np.full(HEIGHT * WIDTH, k, np.uint8), f"{side}_optical"
             picture = T["Image"](header(at, optical), HEIGHT, WIDTH, "mono8", 0, WIDTH, grey)
             messages[f"/{side}/image_raw"] = picture
             messages[f"/{side}/camera_info"] = info(optical, -F * 0.5 * i)
@@ -193,8 +191,7 @@ def test_transforms_pairs_and_hanging_sensors(tmp_path):
     assert (pair.baseline, pair.camera.fx, mount.z) == (pytest.approx(0.5), F, pytest.approx(1.2))
     pitch = [taken.capture.tilt[1] for taken, _ in recorded.captures()]
     assert min(pitch) == pitch[5] == pytest.approx(-0.02 * 10 / 11)
-    hanging = RecordedDrive(write(tmp_path / "hanging", drive(lidar_roll=180.0)))
-    (taken, _), *_ = hanging.captures()
+    (taken, _), *_ = RecordedDrive(write(tmp_path / "hanging", drive(lidar_roll=180.0))).captures()
     ahead = np.argmin(np.abs(SCANNER.angles))
     assert taken.capture.scans["laser"][ahead] == pytest.approx(6.0, abs=0.05)
     scan = mirrored(Scan(-1.0, 0.5, 30.0, np.float32([1, 2, 3, 4]), 0.1))

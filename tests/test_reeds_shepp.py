@@ -86,8 +86,7 @@ def test_the_way_back_is_as_long_and_so_are_the_mirror_images(start, end):
 def test_no_other_way_is_shorter(pieces):
     """Brute force: whatever pieces one drives, the word to the same place is at most as long."""
     lengths, turns = zip(*pieces, strict=True)
-    goal = end_of(lengths, turns)
-    assert distance(ORIGIN, goal) <= sum(map(abs, lengths)) + 1e-6
+    assert distance(ORIGIN, end_of(lengths, turns)) <= sum(map(abs, lengths)) + 1e-6
 
 
 @given(end=poses, radius=st.floats(0.5, 8.0))

@@ -132,8 +132,7 @@ def test_folders_that_hold_no_finished_run_are_refused_in_words(tmp_path):
 
 
 def test_a_total_that_differs_is_told(run, tmp_path, capsys):
-    copy = shutil.copytree(run, tmp_path / "copy")
-    first = iter([True])
+    copy, first = shutil.copytree(run, tmp_path / "copy"), iter([True])
     change_rows(copy, lambda row: next(first, None) and row.update(total_s=1.0))
     make_report(copy, ExecutionSpec(jobs=1))
     assert "episodes.csv says 1.00 s" in " ".join(capsys.readouterr().out.split())
@@ -153,8 +152,7 @@ def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
     make_report(out, ExecutionSpec(jobs=1))
     data = data_of(out / "report.html")
     assert data["run"]["notes"] == [f"There is no replay: {lot} has changed since the run"]
-    assert data["worlds"] == []
-    assert len(data["tables"][0]["rows"]) == 2
+    assert (data["worlds"], len(data["tables"][0]["rows"])) == ([], 2)
 
 
 def test_learning_curves_are_those_of_the_training(tmp_path):

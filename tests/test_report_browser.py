@@ -123,8 +123,7 @@ def test_a_day_with_many_cars_is_played(browser, tmp_path):
 
 def test_a_day_on_a_map_is_played_and_its_blocks_tell_their_day(browser, tmp_path):
     lot = packaged_lot("campus")
-    near = np.argsort(lot.walk_m())
-    names = np.full(lot.n_slots, "", dtype="U16")
+    near, names = np.argsort(lot.walk_m()), np.full(lot.n_slots, "", dtype="U16")
     names[near[:60]], names[near[60:100]] = "Mill Street", "Station"
     supply = {
         "facilities": (Facility("Mill Street", "kerb", "inner"), Facility("Station", "lot")),

@@ -47,8 +47,7 @@ def test_drive_times_and_ways_are_those_of_scipy(drives):
 @given(seed=st.integers(0, 2**32 - 1), chance=st.sampled_from([0.0, 0.01, 0.1, 1.0]))
 @settings(max_examples=60)
 def test_the_nearest_are_all_that_are_as_near(seed, chance):
-    rng = np.random.default_rng(seed)
-    lot = LOTS["grid"]
+    rng, lot = np.random.default_rng(seed), LOTS["grid"]
     routes = DriveRoutes(make_scenario(lot))
     vertex, slots = int(rng.integers(lot.n_vertices)), rng.random(lot.n_slots) < chance
     seconds = np.where(slots, routes.seconds_from(vertex)[: lot.n_slots], np.inf)
@@ -64,8 +63,7 @@ def test_what_no_way_leads_to_is_left_out():
         "one way", ("before", "after"), [[10.0, -5.0], [30.0, -5.0]], [-np.pi / 2] * 2, [5.0] * 2, [2.5] * 2,
         [0, 0], [lane], entries=[[20.0, 0.0]], goals=[[0.0, -10.0]],
     )  # fmt: skip
-    scenario = make_scenario(lot)
-    routes, entry = DriveRoutes(scenario), int(lot.entry_vertices[0])
+    routes, entry = DriveRoutes(make_scenario(lot)), int(lot.entry_vertices[0])
     assert routes.nearest(entry, np.array([True, False]))[1] == np.inf
     assert list(routes.nearest(entry, np.array([True, True]))[0]) == [1]
     for vertex, target in ((entry, 0), (1, 1)):
@@ -115,18 +113,15 @@ def test_a_part_holds_the_vertices_that_may_do_best_and_the_ways_to_them(name):
 
 def test_slots_known_to_be_taken_draw_nobody():
     problem = make_scenario("campus").public()
-    start = int(problem.walk_s.argmin())
-    parts = Neighborhoods(problem, 80)
+    start, parts = int(problem.walk_s.argmin()), Neighborhoods(problem, 80)
     before = parts.around(start, np.empty(0, dtype=np.int64))
-    taken = before.slots[np.argsort(before.cost_s)[:60]]
-    after = parts.around(start, taken)
+    after = parts.around(start, before.slots[np.argsort(before.cost_s)[:60]])
     assert not np.isin(after.slots, before.slots).all()
 
 
 def test_far_from_the_goal_the_part_is_entered_on_a_shortest_route():
     problem = make_scenario(city_lot(3000)).public()
-    entry = int(problem.lot.entry_vertices[0])
-    parts = Neighborhoods(problem, 500)
+    entry, parts = int(problem.lot.entry_vertices[0]), Neighborhoods(problem, 500)
     near = parts.toward(entry)
     assert near is parts.toward(entry)
     assert near.index(entry) == -1

@@ -26,8 +26,7 @@ def drive():
     lot = make_scenario("campus").lot
     scene = slot_lot(lot).scene(np.arange(lot.n_slots) % 4 != 1, 3)
     corners = [(-20.0, 16.0), (0.0, 16.0), (0.0, 0.0), (104.0, 0.0), (98.0, 16.0), (0.0, 16.0)]
-    poses = poses_along(corners, 2.0)
-    rng = np.random.default_rng(0)
+    poses, rng = poses_along(corners, 2.0), np.random.default_rng(0)
     scans = [scan_from_laser(LASER, MOUNT, HERE, LASER.scan(scene.scan_plane, pose, rng)) for pose in poses]
     return lot, poses, scans
 
@@ -87,8 +86,7 @@ def test_without_points_the_pose_follows_the_odometry(drive):
         made = partial(RangeScan, 0.0, 0.0)
         blind = [made(s.angle, np.full(len(s.angle), distance), s.max_range) for s in scans[:30]]
         np.testing.assert_allclose(located(lot, poses[:30], blind)[:, :2], poses[:30, :2], atol=1e-9)
-    matcher = ScanMatcher(lot)
-    np.testing.assert_allclose(matcher.locate(poses[0], []), poses[0])
+    np.testing.assert_allclose(ScanMatcher(lot).locate(poses[0], []), poses[0])
 
 
 def test_moving_cars_do_not_carry_the_pose_along(drive):
@@ -104,12 +102,10 @@ def test_moving_cars_do_not_carry_the_pose_along(drive):
 
 
 def test_a_survey_knows_where_its_car_was():
-    noise = PoseNoise(drift=0.05)
-    options = {"every": 6.0, "weather": "overcast", "pose_noise": noise, "seed": 3}
+    options = {"every": 6.0, "weather": "overcast", "pose_noise": PoseNoise(drift=0.05), "seed": 3}
     settings = SurveySettings(localise="scan-matching", **options)
     scenario, _ = halves(traffic=Traffic())
-    survey = Survey(scenario, settings)
-    result = survey.drive(0)
+    result = Survey(scenario, settings).drive(0)
     errors = [position_error(p, result.true_poses) for p in (result.odometry, result.poses)]
     assert errors[1].mean() < errors[0].mean()
     assert len(result.car_captures) == len(result.session.cars) > 0

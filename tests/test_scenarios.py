@@ -113,8 +113,7 @@ def test_a_file_says_it_all(tmp_path):
         """,
     )
     made = make_scenario(file)
-    assert made.name == "mine"
-    assert made.lot.goals.tolist() == [[3.0, 20.0]]
+    assert (made.name, made.lot.goals.tolist()) == ("mine", [[3.0, 20.0]])
     assert made.occupancy.n_slots == made.lot.n_slots == 12, "rates of 15 slots, mapped to 12"
     assert isinstance(made.prior, ConstantForecast)
     assert set(made.forecast(TUESDAY_NOON).p_occupied) == {0.25}
@@ -128,8 +127,7 @@ def test_a_file_says_it_all(tmp_path):
     env = gym.make("parkenv/Search-v2", scenario=str(file), failure_s=7.0)
     observation, _ = env.reset(seed=3)
     assert (observation["belief"][FORECAST] == 0.25).all()
-    assert env.unwrapped.scenario.failure_s == 7.0
-    assert env.unwrapped.scenario.lot.n_slots == 12
+    assert (env.unwrapped.scenario.failure_s, env.unwrapped.scenario.lot.n_slots) == (7.0, 12)
     assert make_scenario(tmp_path / "lot.geojson").name == "lot", "a lot file alone"
 
     # What was read can be written and read again, from anywhere.
@@ -294,8 +292,7 @@ def test_an_episode_is_that_of_its_place_alone():
     make = partial(gym.make, "parkenv/Search-v2", max_episode_steps=40)
     env = make(scenario=[*PLACES[:4], noisy])
     envs = {place.name: make(scenario=place) for place in (*PLACES[:4], noisy)}
-    met = set()
-    rng = np.random.default_rng(0)
+    met, rng = set(), np.random.default_rng(0)
     for seed in range(9):
         observation, info = env.reset(seed=seed)
         scenario = env.unwrapped.scenario
@@ -343,8 +340,7 @@ def test_a_batch_draws_a_place_at_each_automatic_reset():
     envs = ParkSearchVectorEnv(5, PLACES, observation="local", max_episode_steps=8, autoreset_mode="SameStep")
     _, info = envs.reset(seed=20)
     assert info["_scenario_index"].all()
-    episode = np.zeros(5, dtype=int)
-    rng = np.random.default_rng(0)
+    episode, rng = np.zeros(5, dtype=int), np.random.default_rng(0)
     for _ in range(60):
         places = envs.scenario_index
         drawn = [scenario_of_episode(20 + i, int(e), 6) for i, e in enumerate(episode)]
@@ -406,8 +402,7 @@ def test_a_training_evaluates_on_scenarios_it_never_met(tmp_path, monkeypatch):
     training = search_training("ppo", 2_048, 1_024, PLACES[:4], PLACES[4:], episodes=12)
     curve = training.train(0, tmp_path)
     card = ModelCard.of_file(tmp_path / "model.safetensors")
-    assert card.scenarios == ("lot0", "lot1", "lot2", "lot3")
-    assert card.held_out == ("lot4", "lot5")
+    assert (card.scenarios, card.held_out) == (("lot0", "lot1", "lot2", "lot3"), ("lot4", "lot5"))
     assert {"total_s", "held_out_s", "held_out_parked_fraction"} < set(curve[-1])
     best = min(curve, key=lambda row: row["total_s"])  # the places trained on decide which model is kept
     assert card.results["held_out_s"] == best["held_out_s"]

@@ -37,16 +37,14 @@ def test_files_bring_back_what_was_written_and_say_what_they_are(tmp_path):
 
 @pytest.mark.parametrize("name", SENSOR_MODEL_NAMES)
 def test_the_stack_is_nearly_always_right_beside_the_car(name):
-    model = SensorModel.named(name)
-    rates = model.rates(np.array([0.0]), np.array([True]))
+    rates = SensorModel.named(name).rates(np.array([0.0]), np.array([True]))
     assert rates.hit[0] > 0.95
     assert rates.false_alarm[0] < 0.05
 
 
 def test_unseen_slots_are_known_once_they_were_tried():
     env = gym.make("parkenv/Search-v2", scenario="mini", sensor_model=SensorModel.blind()).unwrapped
-    prior = env.reset(seed=0)[0]["p_occupied"]
-    lot = env.scenario.lot
+    prior, lot = env.reset(seed=0)[0]["p_occupied"], env.scenario.lot
     while True:
         slot = env.state.vertex
         if slot < lot.n_slots and env.state.world.occupied(np.array([slot]), env.state.time)[0]:
@@ -70,8 +68,7 @@ def test_counts_give_the_rates_that_they_were_drawn_from(hit, false_alarm, seen,
                 told = rng.binomial(n, seen)
                 said = rng.binomial(told, rate)
                 looks[band, side, taken] = n - told, told - said, said
-    model = fitted_model(looks)
-    rates = model.rates(np.array(BAND_ENDS), np.ones(len(BAND_ENDS), dtype=bool))
+    rates = fitted_model(looks).rates(np.array(BAND_ENDS), np.ones(len(BAND_ENDS), dtype=bool))
     np.testing.assert_allclose(rates.seen, seen, atol=0.03)
     np.testing.assert_allclose(rates.hit, hit, atol=0.1)
     np.testing.assert_allclose(rates.false_alarm, false_alarm, atol=0.1)

@@ -43,8 +43,7 @@ def test_parts_and_observations_keep_the_belief():
     part = belief.take(np.array([2, 0]))
     assert part.day_error.tolist() == [0.5, 0.25]
     assert (part.age.tolist(), part.observed_taken.tolist()) == ([5.0, np.inf], [True, False])
-    observation = {"time": np.array([0.0, 15.0]), **belief.to_observation()}
-    again = SlotBelief.of_observation(observation)
+    again = SlotBelief.of_observation({"time": np.array([0.0, 15.0]), **belief.to_observation()})
     np.testing.assert_allclose(again.p_occupied, belief.p_occupied, rtol=1e-6)
     assert again.age.tolist() == belief.age.tolist()
     assert again.day_error.tolist() == [0.5, 0.25]

@@ -11,8 +11,7 @@ NOON = 24
 
 def simulated(n_days, level_sd, seed=0, drift=0.0, start=0):
     """Return independent states of slots with habits, and their P(taken), (m, d, p)."""
-    rng = np.random.default_rng(seed)
-    number = start + np.arange(n_days) * 3
+    rng, number = np.random.default_rng(seed), start + np.arange(n_days) * 3
     level = level_sd * rng.normal(size=n_days) + drift * np.arange(n_days)
     habit = np.linspace(-1.5, 1.5, N_SLOTS)[:, None]
     profile = 2.5 * np.sin(np.linspace(0, np.pi, PERIODS)) - 0.5

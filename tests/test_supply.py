@@ -44,8 +44,7 @@ FORBIDDEN = {"inner": Zone("inner", Price(1.0)), "permit": Zone("permit", users=
 
 def town(**changes):
     """The lot `mini` with a kerb of three slots for permits, and a garage."""
-    lot = packaged_lot("mini")
-    kerb = Facility("kerb", "kerb", "permit")
+    lot, kerb = packaged_lot("mini"), Facility("kerb", "kerb", "permit")
     features = {
         "facilities": (GARAGE, kerb),
         "slot_facility": ["kerb"] * 3 + [""] * (lot.n_slots - 3),
@@ -216,22 +215,19 @@ def test_a_wrong_town_is_refused_in_one_line(tmp_path, kind, changes, message):
 
 def test_a_facility_that_no_entry_leads_to_is_named():
     away = replace(packaged_lot("mini").lanes[0], points=np.array([[0.0, 100.0], [30.0, 100.0]]))
-    lot = packaged_lot("mini")
-    far = replace(GARAGE, zone="", xy=(10.0, 105.0))
+    lot, far = packaged_lot("mini"), replace(GARAGE, zone="", xy=(10.0, 105.0))
     with pytest.raises(GraphError, match="facility 0: 'P1' cannot be reached from an entry"):
         replace(lot, lanes=(*lot.lanes, away), facilities=(far,))
     draft = LotDraft.of_lot(replace(lot, lanes=(*lot.lanes, away)))
     kept = replace(draft, facilities=(far, replace(GARAGE, name="P2", zone=""))).searchable()
     assert [facility.name for facility in kept.facilities] == ["P2"]
-    assert kept.left_out[0].ids == ("P1",)
-    assert kept.lot().slot_ids[-1] == "P2"
+    assert (kept.left_out[0].ids, kept.lot().slot_ids[-1]) == (("P1",), "P2")
 
 
 def garage_alone(**facility):
     grid = grid_lot(1, 1)
     fields = {"zone": "", "capacity": 5, "gate_s": 0.0, "inside_s": (0.0, 0.0), "xy": (1.0, 5.0)}
-    garage = replace(GARAGE, **fields | facility)
-    empty = np.zeros(0)
+    garage, empty = replace(GARAGE, **fields | facility), np.zeros(0)
     lot = ParkingLot(
         "garage", (), empty, empty, empty, empty, empty, grid.lanes, grid.entries, grid.goals, facilities=(garage,)
     )  # fmt: skip
@@ -250,8 +246,7 @@ def parked_in(fleet, slot):
 def test_cars_stand_in_line_before_the_barrier():
     scenario = garage_alone(gate_s=20.0, inside_s=(30.0, 80.0))
     fleet = run(scenario, Demand(ListedArrivals((0.0, 1.0, 2.0, 3.0)), ConstantTime(7200.0)))
-    cars = fleet.cars
-    inside_s = 30.0 + 50.0 * np.arange(4) / 5
+    cars, inside_s = fleet.cars, 30.0 + 50.0 * np.arange(4) / 5
     # Each passes 20 s after the one before it, and drives on inside as far as that is full.
     np.testing.assert_allclose(np.diff(cars["ended_at"] - inside_s), 20.0)
     np.testing.assert_allclose(cars["queued_s"], 19.0 * np.arange(4))

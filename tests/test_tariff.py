@@ -64,8 +64,7 @@ def test_what_parking_costs_is_price_times_stay_over_the_value_of_time(scenario)
 def test_a_file_says_what_options_say(tmp_path):
     file = tmp_path / "town.toml"
     file.write_text('lot = "mini"\n[costs]\nprices = { other = 2 }\nvalue_of_time = 8\nstay_s = 900\n')
-    scenario = make_scenario(file)
-    assert set(scenario.parking_cost_s) == {2 * 900 / 8}
+    assert set(make_scenario(file).parking_cost_s) == {2 * 900 / 8}
     again = ScenarioSpec.parse(ScenarioSpec.read(file).tables(), "again")
     assert again.costs == ScenarioSpec.read(file).costs
 
@@ -137,8 +136,7 @@ def test_agents_in_python_know_their_own_stay(scenario):
     policy, agent = policy_of(AgentSpec.of("greedy-total"), scenario)
     assert agent is None
     python = AgentsByStay(AgentSpec.of("greedy-total"), scenario, {})
-    demand = Demand(Headways(8, mean_s=30.0), ExponentialTime(2400.0))
-    slots = []
+    demand, slots = Demand(Headways(8, mean_s=30.0), ExponentialTime(2400.0)), []
     for kind, agents in ((DriverKind(policy=policy), None), (DriverKind(), [python])):
         its = Fleet(scenario, demand, drivers=[kind], background="none")
         slots.append(driven(its, 3, agents=agents).cars["slot"].tolist())
@@ -193,21 +191,18 @@ def priced(lot, cost_s):
 )
 def test_agents_park_elsewhere_where_that_pays(name):
     lot = packaged_lot("mini")
-    plain = empty_lot(lot)
-    chosen = parked_at(name, plain)
+    chosen = parked_at(name, empty_lot(lot))
     # The chosen half of the lot is expensive.
     walk_m = lot.walk_m()
     near = walk_m <= np.median(walk_m) if walk_m[chosen] <= np.median(walk_m) else walk_m > np.median(walk_m)
     dear = empty_lot(priced(lot, np.where(near, DEAR_S, 0.0)))
     assert not near[parked_at(name, dear)]
     # The same price for all slots changes nothing.
-    alike = empty_lot(priced(lot, np.full(lot.n_slots, DEAR_S)))
-    assert parked_at(name, alike) == chosen
+    assert parked_at(name, empty_lot(priced(lot, np.full(lot.n_slots, DEAR_S)))) == chosen
 
 
 def test_the_bound_counts_prices():
-    rng = np.random.default_rng(4)
-    lot = packaged_lot("campus")
+    rng, lot = np.random.default_rng(4), packaged_lot("campus")
     scenario = replace(
         empty_lot(priced(lot, rng.uniform(0.0, 120.0, lot.n_slots))),
         occupancy=OccupancyProcess.from_demand(np.full(lot.n_slots, 2.0), np.zeros(168), 600.0),
@@ -215,8 +210,7 @@ def test_the_bound_counts_prices():
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     for seed in range(5):
         env.reset(seed=seed)
-        state = env.unwrapped.state
-        routes = DriveRoutes(scenario)
+        state, routes = env.unwrapped.state, DriveRoutes(scenario)
         drive_s = routes.seconds_from(state.vertex)[: lot.n_slots]
         free_at = [float(state.world.next_free([s], state.time + d)[0]) for s, d in enumerate(drive_s)]
         total_s = np.array(free_at) - state.time + scenario.walk_s + scenario.lot.slot_parking_cost_s

@@ -83,8 +83,7 @@ def test_peers_measure_what_the_laser_measures(name):
     tolerance = 2 * sensors.GRID_CELL if name == "marching" else 2e-3
     laser = LaserScanner()
     plane, draw = sensors.walled_lot(np.random.default_rng(3), 30)
-    peer = scanner(plane, laser)
-    poses = draw(3)
+    peer, poses = scanner(plane, laser), draw(3)
     ours, theirs = (np.minimum(s, laser.max_range) for s in (laser.scan(plane, poses), peer(poses)))
     assert ((np.abs(ours - theirs) > tolerance).mean(axis=1) < 0.05).all()
     np.testing.assert_array_equal(peer(poses), np.concatenate([peer(pose[None]) for pose in poses]))
@@ -92,8 +91,7 @@ def test_peers_measure_what_the_laser_measures(name):
 
 def test_solvers_are_given_the_same_process():
     mdp = planning.forecast_process(grid_lot(2, 6), 0)
-    p = planning.transitions(mdp)
-    n = mdp.n_states
+    p, n = planning.transitions(mdp), mdp.n_states
     np.testing.assert_allclose(np.asarray(p.sum(axis=1)).ravel(), 1.0)
     values = np.random.default_rng(0).normal(size=n)
     ahead = (p @ np.append(values, 0.0))[:-1].reshape(n, 5)
@@ -155,8 +153,7 @@ def test_methods_of_others_search_and_are_seeded(in_root, name):
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     least = {name: totals(env, make_agent(name, scenario), 4) for name in ("belief", "random")}
     for _ in range(2):
-        state = random.getstate()
-        agent = agent_of(name, scenario)
+        state, agent = random.getstate(), agent_of(name, scenario)
         found.append(totals(adapt_to_agent(env, agent), agent, 4))
         assert random.getstate() == state
         random.seed(1)
@@ -202,8 +199,7 @@ def test_the_mdp_of_bays_is_the_best_order_of_them(in_root):
 
 
 def test_bays_are_markov_chains_to_the_moment_of_arrival(in_root):
-    scenario = parkenv.make_scenario("mini")
-    agent = make_agent("examples.peers.lmu:ReplannedMDP", scenario)
+    agent = make_agent("examples.peers.lmu:ReplannedMDP", parkenv.make_scenario("mini"))
     belief = parkenv.belief.slot_belief.SlotBelief.of_forecast(np.full(10, 0.8), np.full(10, 1e-2))
     belief = belief.update([4], [False])
     assert agent.p_free(belief, np.full(10, 100.0)) == pytest.approx(1.0 - belief.decay(100.0).p_occupied)

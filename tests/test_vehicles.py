@@ -39,8 +39,7 @@ def first_hits(mesh, origin, direction):
         p = np.cross(d, c - a)
         volume = np.sum((b - a) * p, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            u = np.sum((o - a) * p, axis=1) / volume
-            q = np.cross(o - a, b - a)
+            u, q = np.sum((o - a) * p, axis=1) / volume, np.cross(o - a, b - a)
             v, t = (q @ d) / volume, np.sum((c - a) * q, axis=1) / volume
         t = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6), t, np.inf)
         nearest[i], found[i] = t.min(), t.argmin() if np.isfinite(t.min()) else -1
@@ -105,8 +104,7 @@ def test_the_mesh_is_as_large_as_the_model_says_and_its_normals_point_outwards(b
 @EVERY_MESH
 def test_no_gap_shows_a_surface_from_behind(body, level):
     """Rays at a car from all directions first hit an outer surface, never an inner one through a hole."""
-    rng = np.random.default_rng(8)
-    model = VehicleModel.from_seed(body, 2)
+    rng, model = np.random.default_rng(8), VehicleModel.from_seed(body, 2)
     mesh = model.mesh(level)
     around, up = rng.uniform(0, 2 * np.pi, 600), rng.uniform(0.0, 0.9, 600)
     origin = 12.0 * np.column_stack([np.cos(around) * np.cos(up), np.sin(around) * np.cos(up), np.sin(up)])
@@ -127,8 +125,7 @@ def test_one_looks_through_the_glass_onto_an_interior(body):
     assert 20 < np.sum(~opaque) < 400
     parts = (part[opaque] for part in (mesh.triangles, mesh.material, mesh.color))
     seen = type(mesh)(mesh.vertices, mesh.normals, *parts)
-    rng = np.random.default_rng(3)
-    panes = corners(mesh)[~opaque]
+    rng, panes = np.random.default_rng(3), corners(mesh)[~opaque]
     normal = np.cross(panes[:, 1] - panes[:, 0], panes[:, 2] - panes[:, 0])
     side = panes[np.abs(normal[:, 1]) > 0.8 * np.linalg.norm(normal, axis=1)].mean(axis=1)
     target = side[rng.integers(len(side), size=120)]

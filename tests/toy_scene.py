@@ -103,10 +103,8 @@ def ray_depth(scene, camera, pose):
             first, second, offset = b - a, c - a, pose[:3, 3] - a
             p = np.cross(rays, second)
             scale = 1.0 / (p @ first)
-            u = (p @ offset) * scale
-            q = np.cross(offset, first)
-            v = (rays @ q) * scale
-            t = (second @ q) * scale
+            u, q = (p @ offset) * scale, np.cross(offset, first)
+            v, t = (rays @ q) * scale, (second @ q) * scale
             hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.05)
             best = np.where(hit & (t < best), t, best)
     return best.reshape(camera.height, camera.width)

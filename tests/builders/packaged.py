@@ -65,8 +65,7 @@ def campus():
     """A wide lot with double rows, modelled on the Freiburg campus (T Fig. 4.5); the northern aisle is one-way."""
     two_way = False
     south, middle, north = 0.0, 16.0, 32.0
-    passage = 48.5
-    east = {south: 104.0, middle: 98.0, north: 92.0}
+    passage, east = 48.5, {south: 104.0, middle: 98.0, north: 92.0}
     half = AISLE / 2
     rows = [
         row("A", (102.0, south - half), WEST, 9, -1, 10, -1, 10, -1, 8),
@@ -102,10 +101,8 @@ def campus():
 
 def jam():
     """A lot on a site that narrows to the north (after T Fig. 4.10), rotated by 11° like its street."""
-    half = AISLE / 2
-    y = [0.0, 16.0, 32.0, 48.0]
-    west = [0.0, 7.0, 14.0]
-    east = 76.0
+    half, y = AISLE / 2, [0.0, 16.0, 32.0, 48.0]
+    west, east = [0.0, 7.0, 14.0], 76.0
     rows = [
         row("A", (76.5, y[0] - half), WEST, 10, -1, 10, -1, 8),
         row("B", (8.0, y[0] + half), EAST, 12, -1, 12),

@@ -62,8 +62,7 @@ def town():
     """Create the town."""
     rng = np.random.default_rng(2014)
     streets = _streets(rng)
-    blocks = streets.blocks()
-    lanes = _lanes_of(streets)
+    blocks, lanes = streets.blocks(), _lanes_of(streets)
     slots, names = _kerbs(streets, rng)
     car_parks = [_car_park(lanes, blocks[at], name, zone) for name, at, zone in CAR_PARKS]
     slots = Slots.joined([slots, *car_parks])
@@ -112,8 +111,7 @@ def _lanes_of(streets):
 
 def _outer_ends(streets):
     """Return both ends of each main street, (8, 2) m: those along from west and east, then from south and north."""
-    p = streets.crossings
-    ends = []
+    p, ends = streets.crossings, []
     for points in [*p[list(MAIN)], *p[:, list(MAIN)].swapaxes(0, 1)]:
         for end, inner in ((points[0], points[1]), (points[-1], points[-2])):
             ends.append(end + OUTSIDE * (end - inner) / np.hypot(*(end - inner)))
@@ -145,8 +143,7 @@ def _kerbs(streets, rng):
     for name, each, first in BAYS:
         of_all = (level <= 1) & (zone != "residents")
         zone[np.flatnonzero(of_all)[first::each]] = name
-    facility = np.array(names)[at]
-    order = np.lexsort((np.arange(len(slots)), at))
+    facility, order = np.array(names)[at], np.lexsort((np.arange(len(slots)), at))
     made = Slots(
         np.round(slots.xy, 3), np.round(slots.yaw, 9), slots.length, slots.width, slots.mouth,
         zone=zone, facility=facility,
