@@ -1,10 +1,10 @@
 """The driver of queueing theory: it knows everything, drives in no time and takes the slot that costs least."""
 
+from parkenv.compiled.jit import inlined, kernel
 from parkenv.compiled.memory import int64s
 from parkenv.engine.policy import LEAVE, TAKE_SLOT, CompiledPolicy
 from parkenv.engine.records import car_at, fleet_at
 from parkenv.engine.search_belief import is_slot_open
-from parkenv.world.occupancy.kernel import inlined, kernel
 
 
 @inlined

@@ -248,6 +248,32 @@ def test_worlds_of_the_model_leave_as_its_belief_says():
     assert most_free.mean() == pytest.approx(most_said.mean(), abs=0.04)
 
 
+def test_announced_departures_of_the_model_stay_as_drawn_when_the_car_drives_there():
+    scenario, rng = busy(Cues(60.0), p=0.9), np.random.default_rng(0)
+    env, model = gym.make("parkenv/Search-v2", scenario=scenario), parkenv.model(scenario)
+    shown = []
+    for seed in range(40):
+        observation, _ = env.reset(seed=seed)
+        for _ in range(8):
+            observation, *_ = env.step(int(rng.choice(np.flatnonzero(observation["action_mask"][:4]))))
+        neighbors = scenario.lot.neighbors[int(observation["vertex"])]
+        announced = np.append(observation["cues"].reshape(3, -1)[0] > 0.9, False)
+        for action in np.flatnonzero(announced[np.minimum(neighbors, len(announced) - 1)]):
+            slot = int(neighbors[action])
+            waiting = np.flatnonzero(scenario.lot.neighbors[slot] < 0)[0]
+            belief = model.initial_belief(observation)
+            sample = model.sample(belief, rng, 100)
+            for step in (action, *[waiting] * 20):
+                sample.step(np.full(100, step))
+            seen = [sample.observation(i) for i in range(100)]
+            later = belief.slots.decay(seen[0].time - belief.slots.time)
+            free = np.mean([not taken.taken[taken.slots == slot].any() for taken in seen])
+            shown.append((free, 1.0 - later.p_occupied[slot]))
+    free, said = np.mean(shown, axis=0)
+    assert len(shown) >= 3
+    assert free == pytest.approx(said, abs=0.05)
+
+
 def test_what_does_not_know_cues_says_so(tmp_path):
     with pytest.raises(InputError, match=r"hit_rate is 0.1, want at least false_alarm_rate, 0.2"):
         Cues(hit_rate=0.1, false_alarm_rate=0.2)

@@ -1,6 +1,7 @@
 """`parkenv/SearchSensors-v2`: raw observations of the same searches, and what else moves in the lot."""
 
 import copy
+import dataclasses
 import math
 import os
 import subprocess
@@ -18,8 +19,10 @@ from shapely.affinity import rotate, translate
 
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.engine.sensor_sampler import PICTURE_WIDTH, SensorSampler
 from parkenv.lots import packaged_lot
+from parkenv.world.facility import Facility
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.traffic import LotTraffic, _Loops
 from sim_sensors.camera.models import PinholeCamera
@@ -126,6 +129,17 @@ def test_pictures_of_another_width():
     for wrong in (True, 12, 3.5):
         with pytest.raises(InputError, match="picture_width is"):
             make(picture_width=wrong)
+
+
+@pytest.mark.parametrize("name", ["Search", "SearchPerception"])
+def test_live_counts_are_known_at_every_step(name):
+    garage = Facility("P1", "garage", capacity=3, xy=(30.0, 12.0), known="live")
+    scenario = make_scenario(dataclasses.replace(LOT, facilities=(garage,)))
+    env = gym.make(f"parkenv/{name}-v2", scenario=scenario)
+    seen, _ = env.reset(seed=0)
+    for _ in range(2):
+        seen, *_ = env.step(int(seen["action_mask"][:4].argmax()))
+        assert SlotBelief.of_observation(seen).observed_at[-1] == pytest.approx(seen["time"][1])
 
 
 def test_scenes_follow_the_world_and_do_not_depend_on_when_one_looks():

@@ -58,7 +58,7 @@ def _mix64(word: np.uint64) -> np.uint64:
 def keyed_uniform(key: np.uint64, stream: int, slot: int, index: int) -> float:
     """Uniform float64 in the open interval (0, 1), callable from Python and from compiled code.
 
-    `key` comes from `world_key`; `stream`, `slot` and `index` are non-negative integers below 2**63.
+    `key` comes from `world_key`; `stream`, `slot` and `index` are 64-bit integers; negative ones are further streams.
     """
     # Cast here, so that the function below is compiled once and not for each constant argument; and all to uint64,
     # because uint64 with int64 would be promoted to float64.

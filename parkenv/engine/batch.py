@@ -13,6 +13,7 @@ from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.jit import inlined, kernel
 from parkenv.compiled.memory import LINE, int32s, int64s, prefetch, uint8s
 from parkenv.engine.kernel import (
     arrive,
@@ -28,7 +29,7 @@ from parkenv.engine.records import N_ACTIONS, SEARCH, SENTINEL, edge_at, scenari
 from parkenv.engine.search_belief import refresh_belief
 from parkenv.engine.searches import ScenarioRecords, Searches
 from parkenv.engine.spaces import space_of
-from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, inlined, kernel, prefetch_forecast
+from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, prefetch_forecast
 from parkenv.world.scenario import EDGE
 
 _APART = 2  # searches between two stages of loading

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import decay_to_prior
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
+from parkenv.compiled.jit import inlined, kernel
 from parkenv.compiled.keyed_random import car_key
 from parkenv.compiled.memory import (
     LINE,
@@ -97,7 +98,7 @@ from parkenv.engine.search_belief import (
 )
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.decay import decay_factor
-from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
+from parkenv.world.occupancy.kernel import EXTERNAL_KIND
 from parkenv.world.scenario import EDGE
 
 # Why `advance_at` returned, if not for a car to decide: all searches are over; the time limit; more SEARCH records

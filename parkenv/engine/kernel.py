@@ -15,6 +15,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from parkenv.belief.cue_belief import MOST_EVIDENCE, freed
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.jit import inlined, kernel
 from parkenv.compiled.keyed_random import (
     CUE_STREAM,
     ENTRY_STREAM,
@@ -72,8 +73,6 @@ from parkenv.world.occupancy.kernel import (
     PROCESS_KIND,
     SHARED_KIND,
     hour_of_week,
-    inlined,
-    kernel,
 )
 from parkenv.world.week import DAY_S
 
@@ -132,13 +131,14 @@ def init_full_prior_at(address: int) -> None:
 
 @kernel
 def observe_live_at(address: int) -> None:
-    """Observe the live counts at the arrival."""
+    """Observe the live counts."""
     search = search_at(address, 0)
     observe_live(search)
     refresh_belief(search)
 
 
-# One function for each kind of sensor, so that only the kind in use is compiled.
+# One function for each kind of sensor, so that only the kind in use is compiled. Exact is what `observes_exactly` says:
+# no errors, no live counts and no cues, so that no car is in the way.
 
 
 @kernel
@@ -607,8 +607,9 @@ def in_the_way_s(search: Any) -> float:
         return 0.0
     column = column_of(search, slot)
     left, record = leaves_in_s(search, column, search.time), slot_at(search.slots, column)
-    # Its state is still to be observed: `observe_exact` takes a valid one for observed.
-    record.valid_until, record.end_known = -np.inf, False
+    if not record.observed or record.observed_taken != record.occupied:
+        # Its state is still to be observed: `observe_exact` takes a valid one for observed.
+        record.valid_until, record.end_known = -np.inf, False
     return float(left if left <= scenario.moving_s else 0.0)
 
 

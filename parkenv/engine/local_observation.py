@@ -45,7 +45,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, FloatArray
-from parkenv.compiled.jit import compiled
+from parkenv.compiled.jit import compiled, inlined, kernel
 from parkenv.compiled.memory import LINE, float64s, in_one_block, int32s, int64s
 from parkenv.engine.kernel import enter
 from parkenv.engine.records import (
@@ -75,7 +75,7 @@ from parkenv.engine.search_belief import (
 from parkenv.engine.searches import ScenarioRecords, Searches
 from parkenv.errors import require_whole
 from parkenv.world.lot import MOVES
-from parkenv.world.occupancy.kernel import PROCESS_KIND, inlined, kernel, prefetch_forecast
+from parkenv.world.occupancy.kernel import PROCESS_KIND, prefetch_forecast
 from parkenv.world.scenario import SearchProblem
 
 MINUTE = 60.0

@@ -25,6 +25,7 @@ from scipy.special import ndtr
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.jit import kernel
 from parkenv.compiled.memory import address_of, call_at
 from parkenv.engine.batch import first_wrong
 from parkenv.engine.kernel import (
@@ -58,7 +59,7 @@ from parkenv.errors import InputError, require, require_whole
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import DayError, nearness
-from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY, kernel
+from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import MAX_RATE, OccupancyProcess
 from parkenv.world.scenario import Scenario, SearchProblem
 from parkenv.world.week import WEEK_HOURS

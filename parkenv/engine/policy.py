@@ -20,6 +20,7 @@ from parkenv.belief.slot_belief import (
     may_have_decayed,
     observed_state,
 )
+from parkenv.compiled.jit import inlined
 from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, call_address, float64s, int32s, int64s, uint8s
 from parkenv.engine.records import (
@@ -37,7 +38,6 @@ from parkenv.engine.records import (
 )
 from parkenv.engine.search_belief import belief_now, forecast_of, is_forbidden, parking_cost_s
 from parkenv.world.lot import PARK
-from parkenv.world.occupancy.kernel import inlined
 from parkenv.world.scenario import SearchProblem
 
 LEAVE = -1  # action of compiled policies: give up and park elsewhere

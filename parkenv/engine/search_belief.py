@@ -11,6 +11,7 @@ import numpy as np
 from parkenv.belief.cue_belief import freed
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.compiled.arrays import BoolArray
+from parkenv.compiled.jit import inlined, kernel
 from parkenv.compiled.memory import float32s, float64s, int32s, int64s
 from parkenv.engine.records import (
     BLOCK_BITS,
@@ -33,7 +34,7 @@ from parkenv.engine.records import (
     slot_at,
 )
 from parkenv.world.occupancy import kernel as worlds
-from parkenv.world.occupancy.kernel import EXTERNAL_KIND, LOG_KIND, PROCESS_KIND, SHARED_KIND, inlined, kernel
+from parkenv.world.occupancy.kernel import EXTERNAL_KIND, LOG_KIND, PROCESS_KIND, SHARED_KIND
 from parkenv.world.week import WEEK_HOURS
 
 

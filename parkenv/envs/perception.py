@@ -5,7 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from parkenv.engine.kernel import act_at, apply_cues_at, apply_observations_at, finish_step_at
+from parkenv.engine.kernel import (
+    act_at,
+    apply_cues_at,
+    apply_observations_at,
+    finish_step_at,
+    observe_live_at,
+)
 from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.envs.sensors import SensingSearchEnv
 from parkenv.perception.departure_cues import DepartureCues, log_likelihood_ratio
@@ -22,8 +28,8 @@ class OnboardPerception:
     """Sensors and perception pipeline of a searching car, and the belief update from its observations.
 
     Args:
-        scenario: the world. If its sensor model is perfect, the fitted model of the rig replaces it, because the belief
-            update needs the error rates of the real observations.
+        scenario: the world. If its sensor model is perfect, the fitted model of a rig with a laser, or with cameras alone,
+            replaces it, because the belief update needs the error rates of the real observations.
         rig, weather, captures, every: as in `SensorSampler`.
         detector: a detector, or its name as in `make_detector`; None: the scenario's.
 
@@ -50,6 +56,7 @@ class OnboardPerception:
         self._view_starts, self._view_slots = scenario.slots_in_view
         self._rates = scenario.sensor_rates
         self._cues = None if scenario.cues is None else DepartureCues(scenario.lot)
+        self._has_live_counts = len(scenario.live_slots) > 0
         self._kept_s = scenario.cues.lead_s if scenario.cues else 0.0
         self.reset()
 
@@ -69,6 +76,8 @@ class OnboardPerception:
         rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
         self.observation = SlotObservation(observed.slots[used], observed.taken[used])
         apply_observations_at(address, *self.observation, rates.hit[rated], rates.false_alarm[rated])
+        if self._has_live_counts:
+            observe_live_at(address)
         if self._cues is not None and self.results:
             self._update_cues(address, self._cues, (*before, *self.results)[-2:])
 
@@ -122,7 +131,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 2 | largest number of captures on an edge |
     | `every` | 1.25 | m, least distance between captures on an edge |
-    | `detector` | the scenario's | a `Detector`, or `hog`, `side`, `front`, a file (.npz, .onnx), `MODULE:CLASS` |
+    | `detector` | the scenario's | a `Detector`, or `hog`, `side`, `front`, `net`, a file (.npz, .onnx), `MODULE:CLASS` |
     | `picture_width` | 400; a `SensorRig`'s own | px, width of the cameras' pictures; those of a survey have 640 |
 
     The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots

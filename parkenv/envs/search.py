@@ -210,7 +210,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     down, left, right; space parks.
 
     ## Arguments
-    - `scenario`: a name (campus, jam, street, mini), a scenario file (.toml), a lot (.geojson; with days as in busy
+    - `scenario`: a name, such as `campus`, a scenario file (.toml), a lot (.geojson; with days as in busy
       real car parks), a folder of these, a `Scenario`, or a sequence of these; see `parkenv.make_scenarios`.
     - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`. A frame shows which
       slots are truly taken, hidden from the agent, and as colours the agent's belief.

@@ -48,7 +48,7 @@ class SurveySettings:
     pose_noise: PoseNoise = field(default_factory=PoseNoise)  # errors of the vehicle's odometry
     localise: str = "none"  # what corrects the odometry: `none` or `scan-matching`
     seed: int = 0  # seed of worlds, weather and noise
-    # as `make_detector` takes it: `hog`, `side`, `front`, a model file or `MODULE:CLASS`
+    # as `make_detector` takes it: `hog`, `side`, `front`, `net`, a model file or `MODULE:CLASS`
     detector: str = DEFAULT_DETECTOR
     picture_width: int | None = None  # px, of the cameras' pictures; None: the rig's own
 

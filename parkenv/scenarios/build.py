@@ -83,7 +83,7 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
     """Make the scenarios that `scenario=` of an environment, or `--scenario`, stands for.
 
     Args:
-        source: name of a packaged scenario (campus, jam, street, mini); a scenario file (.toml); a lot file
+        source: name of a packaged scenario, such as campus; a scenario file (.toml); a lot file
             (.geojson, .yml), which has a week and days as in busy real car parks; a folder of scenario and
             lot files; the tables of a scenario file; a `ScenarioSpec`; a `ParkingLot` (with a typical week, and days as
             forecast); a `Scenario`; or a sequence of these.
@@ -159,6 +159,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             entry=spec.entry,
             v_drive=(spec.speeds.v_drive_kmh or (TOWN_KMH if lot.is_town else LOT_KMH)) * KMH,
             v_walk=spec.speeds.v_walk_kmh * KMH,
+            # Costs are fields of the scenario by name: failure_s, give_up_s, ...
             **spec.costs.model_dump(exclude={"prices"}),
             tariff=Tariff(spec.costs.prices),
             priced_at_s=window.weekdays[0] * DAY_S + (window.start_s + window.end_s) / 2,

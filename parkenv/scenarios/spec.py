@@ -1,6 +1,6 @@
 """Specification of a scenario file.
 
-Every table of the file has a class here, which validates it. The published JSON schema is made from these classes.
+Every table of the file has a class, here or in `parkenv.world`, which validates it. The published JSON schema is made from these classes.
 """
 
 from __future__ import annotations
@@ -758,7 +758,7 @@ class ScenarioSpec(Spec):
     )
     rig: RigName = Field("laser", description="The simulated sensors of the car.")
     detector: PackagedDetector = Field(
-        "hog", description="Detector for their images: hog, side, front, or a file (.npz, .onnx)."
+        "hog", description="Detector for their images: hog, side, front, net, or a file (.npz, .onnx)."
     )
     traffic: TrafficSpec | None = Field(
         None, description="Other road users; none if absent, some in surveys."

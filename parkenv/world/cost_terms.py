@@ -1,7 +1,7 @@
 """What a step of a search can cost: one table, from which records, sums, `info`, columns, tables and legends are made.
 
-A new term is a row here, a line of `parkenv.engine.kernel` that charges it, and its data in
-`parkenv.world.scenario.SearchProblem`: what a move costs belongs to `edges` and `move_cost_s`, what an arrival costs
+A new term is a row here, a line of `parkenv.engine.kernel` that charges it and a name in its `read_step`, and its data
+in `parkenv.world.scenario.SearchProblem`: what a move costs belongs to `edges` and `move_cost_s`, what an arrival costs
 to `arrival_cost_s`, so that planners foresee it.
 """
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.compiled.jit import compiled
+from parkenv.compiled.jit import compiled, kernel
 from planners.belief.path import (
     Budget,
     Course,
@@ -24,7 +24,7 @@ from planners.belief.path import (
     options_at_hand,
     rollout_path,
 )
-from planners.belief.planning_graph import BeliefSnapshot, PathBuffer, PlanningGraph, Records, is_hidden, leaf
+from planners.belief.planning_graph import BeliefSnapshot, PathBuffer, PlanningGraph, Records, is_hidden
 
 MOST_OPTIONS = 12  # maximum number of slots known to be free that are considered, best first
 NOWHERE, ATTEMPT = -1, -2
@@ -174,7 +174,7 @@ def _plan(c: int, search_s: FloatArray, search: Search, paths: PathBuffer) -> fl
     return float(search_s[c])
 
 
-@leaf
+@kernel
 def _are_equal(stops: Records, others: Records) -> bool:
     """Return whether two paths observe the same slots at the same times, given equal numbers of stops."""
     for k in range(len(stops)):
@@ -220,7 +220,7 @@ def _insert_target(
     return best, Course(best_targets, -1, course.failure_s), work
 
 
-@leaf
+@kernel
 def _evaluate(planned_s: float, search: Search, path: PathBuffer) -> Value:
     """Evaluate a path. If it was expected to take less, `planned_s`, that is its value."""
     if path.state[0].n_stops < 2:
@@ -262,7 +262,7 @@ def _options_and_fallbacks(
     return options, fallback_s
 
 
-@leaf
+@kernel
 def _shows_news(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
     """Return whether any slot in view of a vertex is unobserved or may have become free."""
     for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):

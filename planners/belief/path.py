@@ -20,14 +20,13 @@ import numpy as np
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.compiled.jit import compiled
+from parkenv.compiled.jit import compiled, inlined, kernel
 from planners.belief.planning_graph import (
     BeliefSnapshot,
     PathBuffer,
     PlanningGraph,
     decayed_part,
     is_hidden,
-    leaf,
     mean_over_days,
     needs_attempt,
     reset_weights,
@@ -39,8 +38,6 @@ WORTH_OBSERVING = 0.1
 """Fraction of its usual P(free) from which a slot observed taken is worth another observation."""
 OBSERVE_AGAIN_S = 10.0
 """s between observations of the same slot; a later observation makes up for those left out."""
-step = compiled(error_model="numpy", _nrt=False, forceinline=True)
-"""For the parts of a loop: passing all arrays on at each call would take a third of its time."""
 KEPT_IN_MIND = 32  # number of stops for which a passed free slot is remembered
 
 
@@ -73,7 +70,7 @@ class Course(NamedTuple):
     failure_s: float  # s, failure cost of that planner
 
 
-@leaf
+@kernel
 def rollout_path(course: Course, search: Search, path: PathBuffer) -> None:
     """Roll out a path from the car on. It may return to slots observed taken once they may well be free again.
 
@@ -98,7 +95,7 @@ def rollout_path(course: Course, search: Search, path: PathBuffer) -> None:
         state.left_s = min(_extrapolate(last, n_observations, search.graph, path), state.left_s)
 
 
-@step
+@inlined
 def _start(heading: int, search: Search, path: PathBuffer) -> None:
     graph, belief, state, stops = search.graph, search.belief, path.state[0], path.stops
     # A part of a lot can never be proven full: count one more unobserved slot.
@@ -117,7 +114,7 @@ def _start(heading: int, search: Search, path: PathBuffer) -> None:
     reset_weights(belief, path)
 
 
-@step
+@inlined
 def _choose_target(course: Course, search: Search, path: PathBuffer) -> bool:
     """Set the vertex to drive to; return whether the path goes on.
 
@@ -150,7 +147,7 @@ def _choose_target(course: Course, search: Search, path: PathBuffer) -> bool:
     return p_none > NEGLIGIBLE
 
 
-@leaf
+@kernel
 def _next_target(
     failure_s: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> tuple[int, float]:
@@ -179,7 +176,7 @@ def _next_target(
     return chosen, best
 
 
-@step
+@inlined
 def _drive(search: Search, path: PathBuffer) -> None:
     """Go on to the next vertex on the way to the target, or wait there for an observation."""
     state, graph = path.state[0], search.graph
@@ -194,7 +191,7 @@ def _drive(search: Search, path: PathBuffer) -> None:
     state.n_stops += 1
 
 
-@step
+@inlined
 def _observe_here(search: Search, path: PathBuffer) -> None:
     """Add the observations from the last stop, and the result of an attempt if they do not show the target."""
     state, graph, belief = path.state[0], search.graph, search.belief
@@ -241,7 +238,7 @@ def _observe_here(search: Search, path: PathBuffer) -> None:
     state.n_unobserved -= n_first
 
 
-@step
+@inlined
 def _avoid_proof(graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer) -> None:
     """End a path whose last observation proves the lot full if it shows no free slot: there, or before if better."""
     state, stops, last = path.state[0], path.stops, path.state[0].n_stops - 1
@@ -260,7 +257,7 @@ def _avoid_proof(graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer)
         stops[1].target = -1
 
 
-@leaf
+@kernel
 def is_worth_an_attempt(
     vertex: int, time: float, observed_at: float, graph: PlanningGraph, belief: BeliefSnapshot
 ) -> bool:
@@ -272,7 +269,7 @@ def is_worth_an_attempt(
     return bool(p_free_again(vertex, time, observed_at, belief) > 0.0)
 
 
-@step
+@inlined
 def _is_attempt_due(graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer) -> bool:
     vertex = path.state[0].vertex
     if vertex >= len(path.marks):
@@ -281,7 +278,7 @@ def _is_attempt_due(graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuff
     return bool(is_worth_an_attempt(vertex, path.state[0].time, observed_at, graph, belief))
 
 
-@leaf
+@kernel
 def _repeat_path(
     last: int, n_observations: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
@@ -308,7 +305,7 @@ def _repeat_path(
     return best
 
 
-@leaf
+@kernel
 def _repeat_part(
     first: int, last: int, n_observations: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
@@ -339,7 +336,7 @@ def _repeat_part(
     return period / found + cost_s / found if found > 0.0 else np.inf
 
 
-@leaf
+@kernel
 def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: PathBuffer) -> float:
     """Return the expected time, s, of going on to unobserved slots like those on the second half of the path."""
     stops, observations = path.stops, path.observations
@@ -351,7 +348,7 @@ def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: Pat
     return (stops[last].time - stops[first].time) / found + cost_s / found if found > 0.0 else np.inf
 
 
-@leaf
+@kernel
 def p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
     """Return P(free) at a time, s from now, of a slot observed taken; 0 if too low or too soon.
 
@@ -367,7 +364,7 @@ def p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnaps
     return float(p_free) if p_free >= WORTH_OBSERVING * at.p_free_usual else 0.0
 
 
-@leaf
+@kernel
 def p_free_when_first_observed(
     slot: int, weights: FloatArray, belief: BeliefSnapshot, taken_follows: bool
 ) -> float:
@@ -382,7 +379,7 @@ def p_free_when_first_observed(
     return p_free
 
 
-@leaf
+@kernel
 def expected_cost_to_slot(
     vertex: int,
     slot: int,
@@ -431,7 +428,7 @@ def options_at_hand(
     return best
 
 
-@leaf
+@kernel
 def evaluate_path(search: Search, path: PathBuffer) -> tuple[float, float]:
     """Return the least expected time, s, of following a path with the option to stop at any time.
 
@@ -455,7 +452,7 @@ def evaluate_path(search: Search, path: PathBuffer) -> tuple[float, float]:
     return value, then_s
 
 
-@leaf
+@kernel
 def _set_costs(search: Search, path: PathBuffer) -> None:
     """Set what does not depend on P(free) of the observations: the scratch fields of the path."""
     graph, belief, options, fallback_s = search.graph, search.belief, search.options, search.fallback_s
@@ -515,7 +512,7 @@ def _set_costs(search: Search, path: PathBuffer) -> None:
     stops[n_stops].oldest = newest
 
 
-@leaf
+@kernel
 def _learn_on_the_way(belief: BeliefSnapshot, path: PathBuffer) -> None:
     """Set P(free) of the first observations along a path, given that the car has not parked before."""
     reset_weights(belief, path)
@@ -528,7 +525,7 @@ def _learn_on_the_way(belief: BeliefSnapshot, path: PathBuffer) -> None:
             )
 
 
-@leaf
+@kernel
 def _stop_optimally(path: PathBuffer) -> tuple[float, float]:
     """Evaluate a path, given its costs and P(free) of all its observations."""
     stops, observations, kept_s, value_s = path.stops, path.observations, path.kept_s, path.value_s
@@ -569,7 +566,7 @@ def _stop_optimally(path: PathBuffer) -> tuple[float, float]:
     return onward + nothing, then_s
 
 
-@leaf
+@kernel
 def _sort_observations(first: int, last: int, path: PathBuffer) -> None:
     """Sort the observations made at one stop by the expected time of driving to their slots."""
     observations = path.observations

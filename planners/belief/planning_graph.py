@@ -16,11 +16,7 @@ from numpy.typing import NDArray
 from parkenv.belief.cue_belief import freed
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.compiled.jit import compiled
-
-leaf = compiled(error_model="numpy", _nrt=False)
-"""For functions that make no arrays, nor call one that does: counting references to all arrays of `PlanningGraph` and
-of its like would take more time than the computation, and most of the time of compiling."""
+from parkenv.compiled.jit import kernel
 
 Records = NDArray[Any]
 """A structured array. One array of records compiles several times faster than one array per field."""
@@ -151,7 +147,7 @@ class BeliefSnapshot(NamedTuple):
     evidence: FloatArray  # (n_slots,) float64, 1, or less at a kerb
 
 
-@leaf
+@kernel
 def set_slots(
     belief: BeliefSnapshot,
     parts: FloatArray,
@@ -183,7 +179,7 @@ def set_slots(
         at.least_odds = 1.0 / usual - 1.0
 
 
-@leaf
+@kernel
 def _rate_of_return(leaving: float, usual: float, weights: FloatArray, p_free_if: FloatArray) -> float:
     """Return the rate, 1/s, at which a slot observed taken returns to its usual P(free), averaged over hypotheses.
 
@@ -226,13 +222,13 @@ def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffer:
     )
 
 
-@leaf
+@kernel
 def reset_weights(belief: BeliefSnapshot, path: PathBuffer) -> None:
     for h in range(len(belief.weights)):
         path.weights[h] = belief.weights[h]
 
 
-@leaf
+@kernel
 def mean_over_days(weights: FloatArray, values: FloatArray) -> float:
     """Return the mean of values, (k,), over the hypotheses with weights (k,)."""
     # Four sums at once take a fraction of the time of one, and unlike those that a compiler splits up, are the same on
@@ -249,7 +245,7 @@ def mean_over_days(weights: FloatArray, values: FloatArray) -> float:
     return (first + second) + (third + fourth)
 
 
-@leaf
+@kernel
 def decayed_part(rate: float, seconds: float) -> float:
     """Return 1 - exp(-rate · seconds); a series up to 0.05, where its relative error stays below 1e-7."""
     x = rate * seconds
@@ -258,7 +254,7 @@ def decayed_part(rate: float, seconds: float) -> float:
     return 1.0 - math.exp(-x)
 
 
-@leaf
+@kernel
 def detects_missed(rate: float, missed_rate: float) -> bool:
     """Return whether a view is more likely than not to detect a slot that others have missed.
 
@@ -268,7 +264,7 @@ def detects_missed(rate: float, missed_rate: float) -> bool:
     return rate > missed_rate and rate - missed_rate >= 0.5 * (1.0 - missed_rate)
 
 
-@leaf
+@kernel
 def is_hidden(slot: int, rate: float, belief: BeliefSnapshot) -> bool:
     """Return whether a slot is expected to stay hidden in a view with the given detection rate."""
     if belief.slots[slot].state == UNOBSERVED:
@@ -277,7 +273,7 @@ def is_hidden(slot: int, rate: float, belief: BeliefSnapshot) -> bool:
     return bool(rate <= belief.slots[slot].missed_rate)
 
 
-@leaf
+@kernel
 def needs_attempt(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
     """Return whether only a parking attempt can show if the slot at a vertex is free: it is hidden even from there."""
     if vertex >= len(belief.slots) or belief.slots[vertex].state == OBSERVED_FREE:

@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 
 from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED
+from parkenv.compiled.jit import kernel
 from parkenv.compiled.memory import uint8_array, uint8s
 from parkenv.engine.policy import (
     LEAVE,
@@ -16,7 +17,6 @@ from parkenv.engine.policy import (
     search_of,
 )
 from parkenv.world.lot import PARK
-from parkenv.world.occupancy.kernel import kernel
 from planners.heuristics.rules import (
     FIRST_FREE,
     GREEDY_DRIVE,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.heap import pop, push
-from parkenv.compiled.jit import compiled
+from parkenv.compiled.jit import inlined, kernel
 from parkenv.compiled.memory import ADDRESS, float64_array, float64s, int32_array, int32s, record_at, uint8s
 from parkenv.engine.policy import (
     PolicyData,
@@ -44,9 +44,6 @@ UNOBSERVED_DETOUR = 3.0
 BY_DRIVE, BY_DRIVE_THEN_COST, BY_TOTAL = range(3)
 _N_MOVES = len(MOVES)
 _ROUNDING_S = 1e-6
-
-rule = compiled(error_model="numpy", _nrt=False)
-inlined_rule = compiled(error_model="numpy", _nrt=False, forceinline=True)
 
 
 def addresses(names: str) -> list[tuple[str, Any]]:
@@ -110,7 +107,7 @@ def heuristic_tables(heuristic: int, problems: Sequence[SearchProblem], within_m
     return PolicyData(TABLES, numbers, arrays)
 
 
-@rule
+@kernel
 def keeps_target(heuristic: int, target: int, state: int) -> bool:
     """Return whether a target, or `NO_SLOT`, in a recent state is kept whatever was observed of other slots."""
     if target == NO_SLOT or state == OBSERVED_TAKEN:
@@ -118,7 +115,7 @@ def keeps_target(heuristic: int, target: int, state: int) -> bool:
     return heuristic not in (FIRST_FREE, GREEDY_TOTAL) or state == OBSERVED_FREE
 
 
-@inlined_rule
+@inlined
 def choose_route(
     address: int, place: int, search: int, vertex: int, target: int, moves: NDArray[np.uint8], n_moves: int
 ) -> tuple[int, int]:
@@ -146,7 +143,7 @@ def choose_route(
     return chosen, n_moves
 
 
-@rule
+@kernel
 def still_leads(
     address: int, place: int, search: int, vertex: int, target: int, moves: NDArray[np.uint8], n_moves: int
 ) -> bool:
@@ -175,34 +172,34 @@ def still_leads(
 # ---- what was observed
 
 
-@inlined_rule
+@inlined
 def state_of(tables: Any, search: int, slot: int) -> int:
     return int(recent_state(search_of(search), slot) if search else uint8s(tables.states)[slot])
 
 
-@inlined_rule
+@inlined
 def _p_occupied(tables: Any, search: int, slot: int) -> float:
     return float(p_occupied(search_of(search), slot) if search else float64s(tables.p_occupied)[slot])
 
 
-@inlined_rule
+@inlined
 def _n_known(tables: Any, search: int) -> int:
     """Return of how many slots something may have been observed."""
     return int(search_of(search).n_columns if search else tables.n_slots)
 
 
-@inlined_rule
+@inlined
 def _known_slot(search: int, i: int) -> int:
     return int(known_slot(search_of(search), i) if search else i)
 
 
-@inlined_rule
+@inlined
 def _expected_cost_s(tables: Any, place: int, slot: int) -> float:
     """Return the arrival cost of a slot for the expected stay, s."""
     return float(float64s(tables.arrival_cost_s)[tables.n_slots * place + slot])
 
 
-@inlined_rule
+@inlined
 def cost_of(tables: Any, place: int, search: int, slot: int) -> float:
     """Return the arrival cost of a slot for the car's own stay, s."""
     if search and has_own_price(search_of(search)):
@@ -210,7 +207,7 @@ def cost_of(tables: Any, place: int, search: int, slot: int) -> float:
     return float(_expected_cost_s(tables, place, slot))
 
 
-@inlined_rule
+@inlined
 def _near_s(tables: Any, place: int, search: int) -> float:
     """Return the arrival cost up to which `FIRST_FREE` takes a free slot at once, s.
 
@@ -224,7 +221,7 @@ def _near_s(tables: Any, place: int, search: int) -> float:
 # ---- the choice
 
 
-@inlined_rule
+@inlined
 def _choose_target(tables: Any, place: int, search: int, vertex: int, previous: int) -> int:
     """Return the slot to drive to; `NO_SLOT` if every slot in reach was observed taken."""
     if tables.heuristic == GREEDY_GOAL:
@@ -235,7 +232,7 @@ def _choose_target(tables: Any, place: int, search: int, vertex: int, previous: 
     return int(_nearest(tables, place, search, vertex, False, np.inf, order))
 
 
-@rule
+@kernel
 def _first_free(tables: Any, place: int, search: int, vertex: int, previous: int) -> int:
     """Return the nearest free slot near the goal; without one the target so far, the first one near the goal."""
     near_s = _near_s(tables, place, search)
@@ -254,7 +251,7 @@ def _first_free(tables: Any, place: int, search: int, vertex: int, previous: int
     return int(_nearest(tables, place, search, vertex, False, np.inf, BY_DRIVE))
 
 
-@rule
+@kernel
 def _likeliest_target(tables: Any, place: int, search: int, vertex: int) -> int:
     """Return the slot most likely to be free by now, for where every slot in reach was observed taken.
 
@@ -272,7 +269,7 @@ def _likeliest_target(tables: Any, place: int, search: int, vertex: int) -> int:
     return best
 
 
-@rule
+@kernel
 def _cheapest(tables: Any, place: int, search: int, vertex: int) -> int:
     """Return the candidate with the lowest arrival cost; among equals, the one with the shortest drive."""
     seconds, least, lowest = float64s(tables.seconds), np.inf, np.inf
@@ -293,12 +290,12 @@ def _cheapest(tables: Any, place: int, search: int, vertex: int) -> int:
     return best
 
 
-@rule
+@kernel
 def _search_everywhere(tables: Any, place: int, search: int, vertex: int) -> None:
     _nearest(tables, place, search, vertex, False, -np.inf, BY_DRIVE)
 
 
-@rule
+@kernel
 def _nearest(
     tables: Any, place: int, search: int, vertex: int, only_free: bool, limit_s: float, order: int
 ) -> int:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.heap import pop, push
+from parkenv.compiled.jit import inlined, kernel
 from parkenv.compiled.memory import ADDRESS, float64_array, float64s, int32s, int64s, record_at, uint8s
 from parkenv.engine.policy import (
     PolicyData,
@@ -45,8 +46,6 @@ from planners.heuristics.rules import (
     choose_route,
     cost_of,
     heuristic_tables,
-    inlined_rule,
-    rule,
     state_of,
 )
 
@@ -202,7 +201,7 @@ def _onward(streets: dict[str, NDArray[Any]], n_slots: int, bounds: FloatArray) 
     return onward
 
 
-@rule
+@kernel
 def choose_place(
     address: int, goal: int, search: int, vertex: int, target: int, moves: NDArray[np.uint8], n_moves: int
 ) -> tuple[int, int, float]:
@@ -223,7 +222,7 @@ def choose_place(
     )
 
 
-@rule
+@kernel
 def takes_slot(address: int, goal: int, search: int, slot: int, left_s: float) -> bool:
     """Return whether a driver takes the slot that it passes: free, and for no more than what is left of the index, s.
 
@@ -236,12 +235,12 @@ def takes_slot(address: int, goal: int, search: int, slot: int, left_s: float) -
     return bool(cost_s <= left_s and cost_s < np.inf)
 
 
-@inlined_rule
+@inlined
 def _forecast(streets: Any, search: int, slot: int) -> float:
     return float(forecast(search_of(search), slot) if search else float64s(streets.forecast)[slot])
 
 
-@rule
+@kernel
 def _count_free(streets: Any, search: int) -> None:
     """Count by zone how many of the slots that the driver has seen were free, and how many the forecast expected."""
     zone_of_slot, n_zones = int64s(streets.zone_of_slot), streets.n_zones
@@ -266,14 +265,14 @@ def _count_free(streets: Any, search: int) -> None:
     expected[zone] += n_expected
 
 
-@inlined_rule
+@inlined
 def _observed_slot(streets: Any, slot: int) -> tuple[Any, float, Any]:
     state = uint8s(streets.last_states)[slot]
     seen = np.int64(slot if state != UNOBSERVED else _NONE)
     return seen, 1.0 if state == OBSERVED_FREE else 0.0, float64s(streets.forecast)[slot]
 
 
-@inlined_rule
+@inlined
 def _level(streets: Any, zone: int) -> float:
     """Return the factor of the odds that a slot of a zone is free: as many as were seen over those expected."""
     return float(
@@ -282,7 +281,7 @@ def _level(streets: Any, zone: int) -> float:
     )
 
 
-@inlined_rule
+@inlined
 def _onward_s(streets: Any, goal: int, search: int) -> tuple[int, float]:
     """Return where lower bounds on the drive and the arrival cost from each junction begin, and what to add, s."""
     first = 8 * streets.n_junctions * goal
@@ -291,7 +290,7 @@ def _onward_s(streets: Any, goal: int, search: int) -> tuple[int, float]:
     return streets.onward_cost_s + first, 0.0
 
 
-@inlined_rule
+@inlined
 def _bound_s(streets: Any, goal: int, search: int, k: int) -> float:
     """Return a lower bound on the driver's arrival cost of the slots of a place, s."""
     if search and has_own_price(search_of(search)):
@@ -300,7 +299,7 @@ def _bound_s(streets: Any, goal: int, search: int, k: int) -> float:
     return float(float64s(streets.place_cost_s)[streets.n_places * goal + k])
 
 
-@rule
+@kernel
 def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
     """Find the place of the lowest index from a vertex (A* over the junctions)."""
     n, seconds, reached = streets.n_slots, float64s(streets.seconds), int32s(streets.reached)
@@ -340,13 +339,13 @@ def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
                 _reach(streets, end[street] - n, street, _NONE, far + length_s[street])
 
 
-@inlined_rule
+@inlined
 def _follows(streets: Any, position: int, slot: int) -> bool:
     after, street = position + 1, int32s(streets.street_at)[position]
     return bool(after < int32s(streets.first)[street + 1] and int32s(streets.slots)[after] == slot)
 
 
-@rule
+@kernel
 def _enter(streets: Any, goal: int, search: int, position: int, drive_s: float) -> None:
     street, before_s = np.int64(int32s(streets.street_at)[position]), float64s(streets.along_s)[position]
     _look_along(streets, goal, search, street, position, drive_s - before_s)
@@ -354,7 +353,7 @@ def _enter(streets: Any, goal: int, search: int, position: int, drive_s: float) 
     _reach(streets, np.int64(int32s(streets.end)[street] - streets.n_slots), street, position, end_s)
 
 
-@inlined_rule
+@inlined
 def _reach(streets: Any, junction: int, street: int, position: int, far: float) -> None:
     """Note that a street, entered at a position or -1, leads to a junction."""
     seconds, reached = float64s(streets.seconds), int32s(streets.reached)
@@ -370,7 +369,7 @@ def _reach(streets: Any, junction: int, street: int, position: int, far: float) 
     streets.n_queued = push(keys, vertices, streets.n_queued, bound_s, junction)
 
 
-@rule
+@kernel
 def _look_along(streets: Any, goal: int, search: int, street: int, position: int, before_s: float) -> None:
     """Compare the places along a street, from a position on or, with -1, all, with the best one.
 
@@ -404,13 +403,13 @@ def _look_along(streets: Any, goal: int, search: int, street: int, position: int
                 _compare(streets, cost_of(streets, goal, search, slot) + drive_s / q, last_open, position)
 
 
-@inlined_rule
+@inlined
 def _compare(streets: Any, index_s: float, target: int, position: int) -> None:
     if index_s < streets.best_s:
         streets.best_s, streets.best, streets.best_from = index_s, target, position
 
 
-@rule
+@kernel
 def _plan_moves(streets: Any, vertex: int, moves: NDArray[np.uint8]) -> int:
     """Write the moves to the best place, the last one first; returns their number."""
     move_into, first, via = uint8s(streets.move_into), int32s(streets.first), int32s(streets.via)

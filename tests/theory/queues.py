@@ -10,6 +10,7 @@ from closed_forms import Statement, closed_form
 from line import THESIS_SPEEDS, Line
 from ordered_entry import ORDERED_ENTRY, by_distance
 
+from parkenv.compiled.jit import inlined, kernel
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import LEAVE, TAKE_SLOT, CompiledPolicy
 from parkenv.engine.records import LEFT, PARKED, car_at, fleet_at
@@ -24,7 +25,6 @@ from parkenv.world.demand import (
     LogNormalTime,
     PoissonArrivals,
 )
-from parkenv.world.occupancy.kernel import inlined, kernel
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import HOUR_S

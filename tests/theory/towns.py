@@ -12,6 +12,7 @@ from scipy.sparse.linalg import spsolve
 from small_lots import driven, features
 
 from parkenv.belief.slot_belief import OBSERVED_FREE
+from parkenv.compiled.jit import kernel
 from parkenv.compiled.memory import record_at
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import (
@@ -33,7 +34,6 @@ from parkenv.scenarios.build import make_scenario
 from parkenv.world.demand import ConstantTime, Demand, Headways, PoissonArrivals
 from parkenv.world.facility import Facility
 from parkenv.world.lot import PARK, Lane, ParkingLot
-from parkenv.world.occupancy.kernel import kernel
 from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.tariff import Price, Zone
 from parkenv.world.week import HOUR_S, WEEK_HOURS

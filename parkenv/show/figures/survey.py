@@ -283,7 +283,7 @@ def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, ti
         panels.append(("the truth", "P(taken)", BELIEF_MAP, true))
     # Neither colour map passes through the grey of the asphalt.
     unsure = mpl.colormaps["plasma"], predicted.high - predicted.low
-    panels.append(("how unsure it is", "width of the 95 % interval", *unsure))
+    panels.append(("how unsure it is", "width of the 90 % interval", *unsure))
     caption = "The map: how likely each slot is taken, and how sure the map is"
     with _lots(lot, len(panels), path, caption) as axes:
         for ax, (name, label, colors, values) in zip(axes, panels, strict=True):

@@ -24,7 +24,7 @@ function asColumn(column, value) {
 function decimalsOf(column, values) {
   const numbers = values.flat().filter((value) => typeof value === "number");
   if (numbers.every(Number.isInteger)) return column.digits > 1 ? 0 : column.digits;
-  if (column.digits > 0 || !GIVEN.includes(column.key)) return column.digits;
+  if (column.digits > 0 || !column.given) return column.digits;
   // A cost of 2.5 s must not be rounded where the others are whole numbers.
   return Math.max(...numbers.map((value) => (String(Number(value.toPrecision(4))).split(".")[1] ?? "").length));
 }

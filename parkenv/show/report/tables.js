@@ -5,8 +5,6 @@ const AT_ONCE = 10;
 /** Zones or blocks of a table that a page shows at once. */
 const PLACES_AT_ONCE = 10;
 const SETTING = ["scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"];
-/** Columns of numbers that somebody chose, which are not rounded. */
-const GIVEN = [...SETTING, "arrivals_per_hour"];
 
 function sortValue(value) {
   if (Array.isArray(value)) return value[0];

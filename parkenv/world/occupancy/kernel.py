@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from parkenv.compiled.jit import compiled
+from parkenv.compiled.jit import compiled, inlined, kernel
 from parkenv.compiled.keyed_random import (
     ARRIVAL_STREAM,
     DAY_STREAM,
@@ -45,10 +45,6 @@ _FORGOTTEN = 1e-17
 # Safety factor against rounding for the lower bound of a sojourn's end.
 _SAFE = 1.0 - 1e-6
 _MOMENT_S = 1e-6
-
-# No numba reference counting, which would take most of a step's time: the kernels allocate nothing.
-kernel = compiled(error_model="numpy", _nrt=False)
-inlined = compiled(error_model="numpy", _nrt=False, forceinline=True)
 
 # Kinds of worlds: a generating process; a replayed log; functions at addresses, such as those of a Python class;
 # slots that a fleet of cars shares. Kinds of forecasts: the first two, and EXTERNAL_KIND, computed in Python at every

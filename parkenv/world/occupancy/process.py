@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.jit import kernel
 from parkenv.compiled.keyed_random import world_key
 from parkenv.compiled.memory import address_of
 from parkenv.errors import InputError, naming, require, require_number
@@ -34,7 +35,6 @@ from parkenv.world.occupancy.kernel import (
     PROCESS_KIND,
     draw_arrival,
     hour_of_week,
-    kernel,
 )
 from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, WEEK_S

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.jit import kernel
 from parkenv.compiled.memory import address_of, uint8s
 from parkenv.errors import InputError, require, require_one_of
 from parkenv.files.field_types import as_array
@@ -31,7 +32,6 @@ from parkenv.world.occupancy.kernel import (
     MAX_PROBABILITY,
     MIN_PROBABILITY,
     RECORDED_DAY,
-    kernel,
     recorded_changes,
     recorded_day_at,
     recorded_day_level,
