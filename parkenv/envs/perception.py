@@ -28,8 +28,8 @@ class OnboardPerception:
     """Sensors and perception pipeline of a searching car, and the belief update from its observations.
 
     Args:
-        scenario: the world. If its sensor model is perfect, the fitted model of a rig with a laser, or with cameras alone,
-            replaces it, because the belief update needs the error rates of the real observations.
+        scenario: the world. If its sensor model is perfect, the fitted model of a rig with a laser, or of
+            one with cameras alone, replaces it, because the belief update needs the error rates of the real observations.
         rig, weather, captures, every: as in `SensorSampler`.
         detector: a detector, or its name as in `make_detector`; None: the scenario's.
 
@@ -131,7 +131,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 2 | largest number of captures on an edge |
     | `every` | 1.25 | m, least distance between captures on an edge |
-    | `detector` | the scenario's | a `Detector`, or `hog`, `side`, `front`, `net`, a file (.npz, .onnx), `MODULE:CLASS` |
+    | `detector` | the scenario's | a `Detector`, `hog`, `side`, `front`, `net`, a file (.npz, .onnx), `MODULE:CLASS` |
     | `picture_width` | 400; a `SensorRig`'s own | px, width of the cameras' pictures; those of a survey have 640 |
 
     The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots

@@ -1,6 +1,7 @@
 """Specification of a scenario file.
 
-Every table of the file has a class, here or in `parkenv.world`, which validates it. The published JSON schema is made from these classes.
+Every table of the file has a class, here or in `parkenv.world`, which validates it. The published JSON schema is made
+from these classes.
 """
 
 from __future__ import annotations
