@@ -279,11 +279,6 @@ READERS = {
     "file.yml": read_yaml,
     "track.gpx": read_track,
     "poses.csv": read_track,
-    "log.csv": OccupancyLog.read,
-    "mapping.csv": lambda path: read_mapping(path, ["A", "B"], ("s0", "s1", "s2", "s3"), "the log"),
-    "sight.json": SensorModel.from_file,
-    "calibrated.json": Calibration.from_file,
-    "curve.csv": read_curve,
     **dict.fromkeys(("scene.csv", "scene.json", "scene.toml"), read_scene),
 }
 

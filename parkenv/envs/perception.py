@@ -29,7 +29,8 @@ class OnboardPerception:
 
     Args:
         scenario: the world. If its sensor model is perfect, the fitted model of a rig with a laser, or of
-            one with cameras alone, replaces it, because the belief update needs the error rates of the real observations.
+            one with cameras alone, replaces it, because the belief update needs the error rates of the real
+            observations.
         rig, weather, captures, every: as in `SensorSampler`.
         detector: a detector, or its name as in `make_detector`; None: the scenario's.
 
