@@ -221,12 +221,12 @@ def add_column(search: Any, slot: int) -> int:
 def is_taken(search: Any, column: int, time: float) -> bool:
     record = slot_at(search.slots, column)
     if time >= record.valid_until:
-        find_state(search, record, time)
+        refresh_state(search, record, time)
     return bool(record.occupied)
 
 
 @kernel
-def find_state(search: Any, record: Any, time: float) -> None:
+def refresh_state(search: Any, record: Any, time: float) -> None:
     scenario, slot = scenario_at(search.scenario, 0), np.int64(record.slot)
     if scenario.world_kind == SHARED_KIND:
         # Another car may change it at any time, so `valid_until` stays 0.

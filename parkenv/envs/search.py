@@ -335,7 +335,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if seed is not None or self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
             record["seed_state"] = seed_state(self.np_random_seed)
-        _begin(self.searches, starts)
+        if starts:
+            _choose_start(self.searches, int(record["episode"]), starts)
+        _arrive(self.searches, self._address)
         self._enter_scenario()
         if self.scenario.live_slots.size:
             observe_live_at(self._address)
@@ -409,19 +411,20 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._observer.observe(vertex)
 
 
-def _begin(searches: Searches, starts: Mapping[str, Any]) -> None:
-    record, address = searches.records[0], searches.address
-    if starts:
-        before = record.copy()
-        try:
-            choose_start(searches, 0, int(record["episode"]), starts)
-        except InputError:
-            searches.records[0] = before  # so that no later reset uses what was valid of these options
-            raise
+def _arrive(searches: Searches, address: int) -> None:
     begin_search_at(address)
     if searches.needs_python:
         searches.complete_arrival(0)
         init_full_prior_at(address)
+
+
+def _choose_start(searches: Searches, episode: int, starts: Mapping[str, Any]) -> None:
+    before = searches.records[0].copy()
+    try:
+        choose_start(searches, 0, episode, starts)
+    except InputError:
+        searches.records[0] = before  # so that no later reset uses what was valid of these options
+        raise
 
 
 @cache
