@@ -234,8 +234,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ```
 
     ## Version history
-    - v2: observations gain `day_error` and `step_observed`; packaged scenarios have days that differ from their
-      forecast.
+    - v2: observations gain `day_error` and `step_observed`; days of packaged scenarios differ from their forecast.
     - v1: observations gain `belief`.
     - v0: first version.
     """
