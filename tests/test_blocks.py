@@ -97,7 +97,7 @@ def test_purposes_add_up_to_all_cars(run):
 
 
 def test_detours_of_lanes_are_those_of_cars(run):
-    days = run[0].results.of(run[0].study, run[0].study.cells()[0])
+    days = run[0].study.rows_of(run[0].study.cells()[0], run[0].results)
     for lanes, blocks, day, cars in zip(columns(run, LANES), columns(run, BLOCKS), days, run[1], strict=True):
         cruised_m = lanes["cruised_m"].sum()
         assert lanes["driven_m"].sum() == pytest.approx(cars["driven_m"].sum(), rel=1e-3)

@@ -198,7 +198,7 @@ def open_run_of(folder):
 def test_a_finished_run_is_read_again(tmp_path):
     result, again = run(TOY, tmp_path), open_run_of(tmp_path)
     assert (again.study, again.rows, again.summary) == (TOY, result.rows, result.summary)
-    assert again.results.of(TOY, TOY.cells()[1])[2] == {"power": 3, "number": 2, "value": 8}
+    assert TOY.rows_of(TOY.cells()[1], again.results)[2] == {"power": 3, "number": 2, "value": 8}
     assert "holds no finished run" in refusal(open_run, tmp_path / "none")
 
 

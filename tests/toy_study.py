@@ -46,8 +46,10 @@ class Toy(Study):
         return [{"power": work.power, "number": n, "value": self.offset + n**work.power} for n in items]
 
     def summarise(self, results):
-        sums = {cell.work.power: [row["value"] for row in results.of(self, cell)] for cell in self.cells()}
+        sums = {
+            cell.work.power: [row["value"] for row in self.rows_of(cell, results)] for cell in self.cells()
+        }
         return {"rows": [{"power": power, "sum": sum(values)} for power, values in sums.items()]}
 
-    def outputs(self, result):
-        return [(result.folder / "done.txt").touch]
+    def outputs(self, results, summary):
+        return [(results.path / "done.txt").touch]

@@ -26,7 +26,6 @@ from parkenv.world.cost_terms import COST_FIELDS
 
 if TYPE_CHECKING:
     from parkenv.engine.search_record import SearchRecord
-    from parkenv.studies.study import Cell, Study
 
 Row = dict[str, Any]
 Key = tuple[Any, ...]
@@ -235,13 +234,6 @@ class Results:
 
     def rows(self, table: Table = EPISODES) -> Mapping[Key, Row]:
         return self._rows[table.file]
-
-    def of(self, study: Study, cell: Cell) -> list[Row]:
-        rows = self.rows(study.table)
-        return [rows[key] for item in cell.items for key in study.keys(cell.work, item) if key in rows]
-
-    def all_of(self, study: Study) -> list[Row]:
-        return [row for cell in study.cells() for row in self.of(study, cell)]
 
     def replace(self, rows: Iterable[Row], table: Table) -> None:
         self._rows[table.file] = {table.key(row): row for row in rows}

@@ -207,7 +207,7 @@ def _put_in_order(stages: Sequence[Stage], results: Results) -> None:
 def _draw(result: Result, progress: Progress) -> None:
     """Write the outputs, in processes of this machine: only they can write the folder."""
     with Workers(result.study.jobs or None) as workers:
-        run_tasks("Drawing figures", result.study.outputs(result), workers, progress)
+        run_tasks("Drawing figures", result.study.outputs(result.results, result.summary), workers, progress)
 
 
 def _run_stage(

@@ -29,7 +29,6 @@ from parkenv.studies.workers import Task, Workers
 if TYPE_CHECKING:
     from parkenv.show.report.page import Page
     from parkenv.show.tables import Column
-    from parkenv.studies.runner import Result
 
 STUDIES: Mapping[str, str] = {
     "compare": "parkenv.studies.compare.comparison:Comparison",
@@ -226,8 +225,16 @@ class Study(ExecutionSpec):
     def summarise(self, results: Results) -> Row:
         """Return what `summary.json` holds besides command, version and seed; `rows` is its table."""
 
-    def outputs(self, result: Result) -> list[Task[object]]:
-        """Return tasks that write what follows from a result into its folder, such as figures."""
+    def rows_of(self, cell: Cell, results: Results) -> list[Row]:
+        """Return the finished rows of a cell, in the order of its items."""
+        rows = results.rows(self.table)
+        return [rows[key] for item in cell.items for key in self.keys(cell.work, item) if key in rows]
+
+    def all_rows(self, results: Results) -> list[Row]:
+        return [row for cell in self.cells() for row in self.rows_of(cell, results)]
+
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
+        """Return tasks that write what follows from results and their summary into the folder, such as figures."""
         return []
 
     @classmethod

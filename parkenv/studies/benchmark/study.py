@@ -22,7 +22,6 @@ from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.studies.benchmark.suite import Suite
-    from parkenv.studies.runner import Result
 
 RESULT = "result.json"
 AGENTS = ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
@@ -128,12 +127,12 @@ class Benchmark(CaseStudy):
             return super().printed(summary, folder)
         return [score_table([read_json(folder / RESULT)])] if summary["complete"] else []
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.studies.benchmark.suite import result_of, write_result
 
         if self.on is not None:
             return []
-        finished = result.results.rows(self.table)
-        command = result.summary["command"]
+        finished = results.rows(self.table)
+        command = summary["command"]
         content = result_of(self.made_suite, self.cells(), finished, command, self.by, self.code)
-        return [partial(write_result, result.folder, content, RESULT)]
+        return [partial(write_result, results.path, content, RESULT)]

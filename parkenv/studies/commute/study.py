@@ -36,7 +36,6 @@ from planners.names import WITHOUT_FORECAST
 
 if TYPE_CHECKING:
     from parkenv.studies.commute.runs import CommuteRun, Day
-    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 MAX_DAYS = 3_650  # maximum number of days of a commute
@@ -205,7 +204,7 @@ class Commute(Study):
     def summarise(self, results: Results) -> Row:
         from parkenv.studies.commute.runs import day_rows, week_rows
 
-        episodes = [row for cell in self.cells() for row in results.of(self, cell)]
+        episodes = [row for cell in self.cells() for row in self.rows_of(cell, results)]
         return {"rows": day_rows(episodes), "weeks": week_rows(episodes)}
 
     @classmethod
@@ -222,7 +221,7 @@ class Commute(Study):
             tables.append(table_of("weeks", f"{title}, by days", rows, columns))
         return tables
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.show.figures.times import save_commute_curves
 
-        return [partial(save_commute_curves, result.rows, result.folder / PICTURE)]
+        return [partial(save_commute_curves, summary["rows"], results.path / PICTURE)]

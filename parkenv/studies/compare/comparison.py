@@ -45,7 +45,6 @@ from planners.names import BOUND, HUMAN
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.compare.cases import Case
-    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 DEFAULT_AGENTS = (
@@ -372,7 +371,7 @@ class Comparison(CaseStudy):
             "calibrated": None if measured is None else dataclasses.asdict(measured),
         }
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.studies.compare.figures import ComparisonResults, draw_figures
 
         flat = {
@@ -381,13 +380,13 @@ class Comparison(CaseStudy):
         }
         data = ComparisonResults(
             _driven(self.cases),
-            result.results.rows(self.table),
-            [row for row in result.rows if row["agent"] != BOUND],
-            result.summary["occupancy_rows"],
+            results.rows(self.table),
+            [row for row in summary["rows"] if row["agent"] != BOUND],
+            summary["occupancy_rows"],
             flat,
             self.seed,
         )
-        return [partial(draw_figures, data, result.folder)]
+        return [partial(draw_figures, data, results.path)]
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from parkenv.studies.curve.curves import Paths
     from parkenv.studies.curve.zones import LoneSearches, Zones
     from parkenv.studies.fleet.day import Day
-    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 PICTURE = "curve.png"
@@ -199,16 +198,16 @@ class CurveStudy(FleetSpec):
         zones = {name: len(zones.names) for name, zones in self.zones.items()}
         return summary | {"zones": zones, "reach_m": self.reach_m, "errors": errors}
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.show.figures.fleet import save_curves
         from parkenv.studies.curve.curves import FORMS, PREDICTORS, fit_form, form_at, load_curves
         from parkenv.studies.fleet.day import ALL
 
-        if "zones" not in result.summary:
+        if "zones" not in summary:
             return []
-        curves, points = load_curves(result.folder).curves, [*result.results.rows(HELD_OUT).values()]
+        curves, points = load_curves(results.path).curves, [*results.rows(HELD_OUT).values()]
         tasks: list[Task[object]] = []
-        errors = [row for row in result.summary["errors"] if row["held_out"] == "zones"][:1]
+        errors = [row for row in summary["errors"] if row["held_out"] == "zones"][:1]
         off = {key: row[key] for row in errors for key in (*PREDICTORS, "chance")}
         for name, zones in self.zones.items():
             by_purpose = {p: curve for (s, z, p, h), curve in curves.items() if (s, z, h) == (name, ALL, ALL)}
@@ -221,7 +220,7 @@ class CurveStudy(FleetSpec):
                 {form: partial(form_at, form, fit_form(form, x, y, cars)) for form in FORMS} if len(x) else {}
             )
             title = f"{name}: {plural(len(zones.names), 'zone')}, {plural(self.days, 'day')} of each demand"
-            path = result.folder / (PICTURE if len(self.zones) == 1 else file_name(f"curve_{name}", ".png"))
+            path = results.path / (PICTURE if len(self.zones) == 1 else file_name(f"curve_{name}", ".png"))
             tasks.append(partial(save_curves, by_purpose, of_zones, off, forms, title, path))
         return tasks
 

@@ -28,7 +28,6 @@ from parkenv.world.sensor_model import SensorModel
 if TYPE_CHECKING:
     from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SessionResult, SurveySettings
-    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 AGENTS = ("mdp", "belief", "first-free", "greedy-drive", "oracle")
@@ -171,23 +170,23 @@ class Demo(CaseStudy):
             "survey": surveyed[0] if surveyed else None,
         }
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.show.figures.survey import save_detections, save_session
         from parkenv.studies.compare.figures import ComparisonResults, draw_figures
         from parkenv.studies.compare.search_film import film_search
 
-        folder, scenario = result.folder, self.survey.built
+        folder, scenario = results.path, self.survey.built
         cells = self.cases_in(folder)
         filmed = next(case for case, _ in cells if case.agent == FILMED)
         drawn = self.more_cases_in(folder) if self.more else cells
-        shown = [row for row in result.rows if row["scenario"] == drawn[0].work.scenario.name]
-        data = ComparisonResults(drawn, result.results.rows(EPISODES), shown)
+        shown = [row for row in summary["rows"] if row["scenario"] == drawn[0].work.scenario.name]
+        data = ComparisonResults(drawn, results.rows(EPISODES), shown)
         tasks: list[Task[object]] = [
             partial(film_search, filmed, cells[0].items[0], folder / FILM),
             partial(_draw_map, scenario, self._log(folder), self.sessions, folder / "map.png"),
             partial(draw_figures, data, folder, FIGURES),
         ]
-        if (kept := result.results.kept.get(SHOWN)) is not None:
+        if (kept := results.kept.get(SHOWN)) is not None:
             tasks += [
                 partial(save_detections, kept[0], folder / "detections.png"),
                 partial(save_session, scenario.lot, kept[0], folder / "session.png"),

@@ -23,7 +23,6 @@ from parkenv.world.week import HOUR_S
 if TYPE_CHECKING:
     from parkenv.compiled.arrays import FloatArray, IntArray
     from parkenv.studies.fleet.counted_demand import CountedTown
-    from parkenv.studies.runner import Result
     from parkenv.studies.workers import Task
 
 PREDICTIONS = ("simulated", "forecast", "last_week", "mean_followed")  # predictions of the counts
@@ -248,20 +247,20 @@ class DemandStudy(Study):
                 come[i, k], stay_h[i, k] = sum(purpose.arrivals_per_hour), purpose.stay_s / HOUR_S
         return HeldOutErrors(days, shares, fit_error, come, stay_h)
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.show.figures.fleet import CarParkDays, save_counted_demand
 
-        town, held_out, fits = self.town, self._held_out(result.results), result.results.rows(FITTED)
+        town, held_out, fits = self.town, self._held_out(results), results.rows(FITTED)
         last, first_kind = self.roll_outs - 1, None
-        predictions = list(result.results.rows(DAYS).values())
+        predictions = list(results.rows(DAYS).values())
         columns = ("car_park", "hour", "counted", *PREDICTIONS)
         table = Table("predicted.csv", ("date",), columns, long=True)
-        tasks: list[Task[object]] = [partial(table.write, result.folder, predictions)]
+        tasks: list[Task[object]] = [partial(table.write, results.path, predictions)]
         for kind in KINDS:
             if car_parks := fits[last, kind]["car_parks"]:
                 demand = self.scenario.demand | {name: fit["purpose"] for name, fit in car_parks.items()}
                 scenario = self.scenario.changed(demand=demand)
-                tasks.append(partial(scenario.write, result.folder / f"{kind}.json"))
+                tasks.append(partial(scenario.write, results.path / f"{kind}.json"))
                 first_kind = first_kind or kind
         if first_kind is None:
             return tasks  # nothing was counted in the last weeks
@@ -276,7 +275,7 @@ class DemandStudy(Study):
             for k in np.flatnonzero(np.isfinite(known).any(axis=(1, 2)))
         ]
         hours = town.hours.astype(np.float64) + 1.0
-        return [*tasks, partial(save_counted_demand, car_park_days, hours, result.folder / "demand.png")]
+        return [*tasks, partial(save_counted_demand, car_park_days, hours, results.path / "demand.png")]
 
 
 class HeldOutErrors(NamedTuple):  # finished days: n car parks on d days; NaN: unknown

@@ -57,7 +57,6 @@ if TYPE_CHECKING:
     from parkenv.engine.fleet import Fleet
     from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.fleet.day import Day, Roads
-    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 MAX_SETTINGS = 10_000  # maximum number of settings of a study
@@ -292,7 +291,7 @@ class FleetSpec(Study):
         return work.agent.label
 
     def finished_days(self, results: Results) -> list[list[Row]]:
-        return [rows for cell in self.cells() if (rows := results.of(self, cell))]
+        return [rows for cell in self.cells() if (rows := self.rows_of(cell, results))]
 
     def cautions(self) -> dict[str, str]:
         from parkenv.lots.draft import read_provenance
@@ -402,7 +401,7 @@ class FleetStudy(FleetSpec):
             "cautions": self.cautions(),
         }
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.show.figures.fleet import save_fleet_figure, save_zones_figure
         from parkenv.studies.fleet.day import has_zones, random_order_search_s
         from parkenv.studies.fleet.day_replay import write_map_page
@@ -411,16 +410,16 @@ class FleetStudy(FleetSpec):
         tasks: list[Task[object]] = [
             partial(
                 save_fleet_figure,
-                [row for row in result.rows if row["scenario"] == name],
+                [row for row in summary["rows"] if row["scenario"] == name],
                 partial(random_order_search_s, scenario),
                 f"{name}: {plural(scenario.lot.n_slots, 'slot')}, {plural(self.days, 'day')}",
-                result.folder / (PICTURE if len(self.built) == 1 else file_name(f"fleet_{name}", ".png")),
-                [row for row in result.summary["hours"] if row["scenario"] == name],
+                results.path / (PICTURE if len(self.built) == 1 else file_name(f"fleet_{name}", ".png")),
+                [row for row in summary["hours"] if row["scenario"] == name],
             )
             for name, scenario in self.built.items()
         ]
-        rows = {table.file: list(result.results.rows(table).values()) for table in TABLES}
-        tasks.append(partial(write_map_page, self, result.summary, rows, result.folder))
+        rows = {table.file: list(results.rows(table).values()) for table in TABLES}
+        tasks.append(partial(write_map_page, self, summary, rows, results.path))
         for setting in self.shown_settings:
             scenario = self.built[setting.scenario]
             days = [row for row in rows[BLOCKS.file] if setting.holds(row)]
@@ -428,7 +427,7 @@ class FleetStudy(FleetSpec):
                 name = "zones" if len(self.built) == 1 else f"zones_{setting.scenario}"
                 title = f"{setting.scenario}: zones, {setting.agent.label}, {rate_text(setting.arrivals_per_hour)}"
                 _, hours, courses = by_hour(days, "zone")
-                path = result.folder / file_name(name, ".png")
+                path = results.path / file_name(name, ".png")
                 tasks.append(partial(save_zones_figure, scenario.lot, title, hours, courses, path))
         return tasks
 

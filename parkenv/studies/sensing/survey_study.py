@@ -24,7 +24,6 @@ from parkenv.world.occupancy.arrival_window import ArrivalWindow
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
-    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 PICTURES = 4  # number of perception results of the first session that are kept for figures
@@ -246,15 +245,17 @@ class SurveyStudy(Study):
     def summarise(self, results: Results) -> Row:
         from parkenv.studies.sensing.surveys import summarize
 
-        rows = results.of(self, self.cells()[0])
+        rows = self.rows_of(self.cells()[0], results)
         file = results.path / MAP_FILE
         return {"rows": [summarize(self.built, self.drive_settings, rows, file)] if rows else []}
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.studies.sensing.surveys import draw_survey
 
-        shown, _ = result.results.kept.get(SHOWN, (None, None))
-        return [partial(draw_survey, self.built, self.drive_settings, result.rows[0], shown, result.folder)]
+        shown, _ = results.kept.get(SHOWN, (None, None))
+        return [
+            partial(draw_survey, self.built, self.drive_settings, summary["rows"][0], shown, results.path)
+        ]
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:

@@ -222,7 +222,7 @@ class TrainingSpec(Study):
                     beside.write_bytes(content)
 
     def summarise(self, results: Results) -> Row:
-        if len(results.of(self, self.cells()[0])) < self.trainings:
+        if len(self.rows_of(self.cells()[0], results)) < self.trainings:
             return {"rows": []}
         return {"settings": self.settings(), **self.training.report(results)}
 

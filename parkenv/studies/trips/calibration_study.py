@@ -21,7 +21,6 @@ from parkenv.studies.study import Cell, Labelled, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
-    from parkenv.studies.runner import Result
     from parkenv.studies.trips.driven_car import DrivingStyle
     from parkenv.studies.trips.driven_search import DrivenSearch
     from parkenv.world.scenario import Scenario
@@ -131,7 +130,7 @@ class CalibrationStudy(Study):
     def summarise(self, results: Results) -> Row:
         from parkenv.studies.trips.driven_search import calibrate
 
-        rows, calibrated, table = results.all_of(self), None, list[Row]()
+        rows, calibrated, table = self.all_rows(results), None, list[Row]()
         try:
             calibration, table = calibrate(rows, self.built, self.speed_limit)
             calibrated = dataclasses.asdict(calibration)
@@ -162,13 +161,13 @@ class CalibrationStudy(Study):
         trips = plural(self.episodes, "trip")
         return f"{self.built.name}: {trips} with and as many without observations, by {self.agent.label}"
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.scenarios.calibration import Calibration
         from parkenv.studies.trips.driven_search import save_distributions
 
-        picture = result.folder / file_name(f"calibration_{self.built.name}", ".png")
-        rows = result.results.all_of(self)
+        picture = results.path / file_name(f"calibration_{self.built.name}", ".png")
+        rows = self.all_rows(results)
         return [
-            partial(Calibration(**result.summary["calibrated"]).to_file, result.folder / CALIBRATED),
+            partial(Calibration(**summary["calibrated"]).to_file, results.path / CALIBRATED),
             partial(save_distributions, rows, self.speed_limit, self.title, picture),
         ]

@@ -25,7 +25,6 @@ from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.driving.scene import Scene
-    from parkenv.studies.runner import Result
     from parkenv.studies.workers import Task
     from planners.driving.manoeuvre import Manoeuvre
 
@@ -161,7 +160,7 @@ class ManoeuvreStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         names = (*MANOEUVRES.keys, *MANOEUVRES.columns)
-        rows = [{name: row[name] for name in names} for row in results.all_of(self)]
+        rows = [{name: row[name] for name in names} for row in self.all_rows(results)]
         levels = {
             name: "cases" if isinstance(source, Path) else source[0] for name, source in self.sources.items()
         }
@@ -182,26 +181,26 @@ class ManoeuvreStudy(Study):
             for row in summary.get("agents", ())
         ]
 
-    def outputs(self, result: Result) -> list[Task[object]]:
+    def outputs(self, results: Results, summary: Row) -> list[Task[object]]:
         from parkenv.show.figures.manoeuvres import save_manoeuvre_film, save_manoeuvres
 
-        rows = sorted(result.rows, key=lambda row: row["driven"])
-        driven = result.results.rows(TRAJECTORIES)
+        rows = sorted(summary["rows"], key=lambda row: row["driven"])
+        driven = results.rows(TRAJECTORIES)
         shown = [
             (self.scene(row["case"]), driven[MANOEUVRES.key(row)], self._says(row))
             for row in rows[: 5 * SHEET]
         ]
         tasks: list[Task[object]] = [
-            partial(save_manoeuvres, shown[i : i + SHEET], result.folder / f"manoeuvres_{i // SHEET + 1}.png")
+            partial(save_manoeuvres, shown[i : i + SHEET], results.path / f"manoeuvres_{i // SHEET + 1}.png")
             for i in range(0, len(shown), SHEET)
         ]
         if parked := [row for row in rows if row["driven"]]:
             scenes = {row["case"]: self.scene(row["case"]) for row in parked}
             # Where others move, if anywhere.
             row = max(parked, key=lambda row: (len(scenes[row["case"]].crossings), row["direction_changes"]))
-            others = result.results.rows(ROAD_USERS).get(MANOEUVRES.key(row), {})
+            others = results.rows(ROAD_USERS).get(MANOEUVRES.key(row), {})
             what = scenes[row["case"]], driven[MANOEUVRES.key(row)], others
-            tasks.append(partial(save_manoeuvre_film, *what, result.folder / "manoeuvre.gif"))
+            tasks.append(partial(save_manoeuvre_film, *what, results.path / "manoeuvre.gif"))
         return tasks
 
     def _says(self, row: Row) -> str:
