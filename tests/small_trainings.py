@@ -7,7 +7,7 @@ import torch
 from numba import get_num_threads
 
 from parkenv.studies.training import configs
-from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.training.study import TrainingStudy
 from parkenv.studies.training.training import Training, save_checkpoint
 
 get_num_threads()  # first: it sets the number that PyTorch has, too
@@ -29,7 +29,7 @@ def make_small(patch):
 def search_training(algorithm, steps, every, places, held_out=(), episodes=4, **fields):
     """A training in places that are no files."""
     options = {"evaluate_every": every, "evaluation_episodes": episodes, **fields}
-    training = Training(TrainingSpec(algorithm=algorithm, steps=steps, **options))
+    training = Training(TrainingStudy(algorithm=algorithm, steps=steps, **options))
     training.sides = places, held_out
     return training
 

@@ -16,7 +16,8 @@ from command_line import PARKENV, parkenv, refused
 from parkenv import InputError
 from parkenv.cli import COMMANDS as LISTED
 from parkenv.cli import app
-from parkenv.cli.options import command_class, field_options, spec_of
+from parkenv.cli.command import command_class
+from parkenv.cli.options import field_options, spec_of
 from parkenv.envs.sensors import SearchSensorsEnv
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, RigName
 from parkenv.studies.compare.comparison import LEVELS

@@ -27,7 +27,7 @@ from parkenv.scenarios.selection import lot_share, scenario_of_episode, split_by
 from parkenv.scenarios.spec import ScenarioSpec, lot_scenario, scenario_spec, scenario_specs
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.study import schemas
-from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.training.study import TrainingStudy
 from parkenv.studies.training.training import Training, episode_times
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError, nearness
@@ -416,7 +416,7 @@ def test_a_training_evaluates_on_scenarios_it_never_met(tmp_path, monkeypatch):
 
 def test_a_task_names_both_sides_and_keeps_them_apart(folder):
     specs = tuple(scenario_specs(folder))
-    training = Training(TrainingSpec().changed(scenarios=specs, held_out=0.5))
+    training = Training(TrainingStudy().changed(scenarios=specs, held_out=0.5))
     names = tuple({one.name for one in side} for side in training.sides)
     assert names[0] | names[1] == {spec.title for spec in specs}
     assert not names[0] & names[1]
@@ -428,4 +428,4 @@ def test_a_task_names_both_sides_and_keeps_them_apart(folder):
         (specs[1:2], "scenarios has 'lot0' twice, want different names"),
     ):
         with pytest.raises(InputError, match=message):
-            Training(TrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
+            Training(TrainingStudy().changed(scenarios=specs, evaluate_on=others)).settings()

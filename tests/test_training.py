@@ -31,7 +31,7 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.runner import run
 from parkenv.studies.training.configs import SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import read_curve
-from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.training.study import TrainingStudy
 from parkenv.studies.training.training import TRAINING_SEEDS, episode_times
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
@@ -258,7 +258,7 @@ def test_a_training_in_this_process_leaves_global_seeds_and_threads(tmp_path):
     drawn = random.getstate(), np.random.get_state(), torch.get_rng_state().tolist()  # noqa: NPY002
     try:
         fields = {"steps": 100, "trainings": 1, "agents": [], "evaluation_episodes": 2, "jobs": 1}
-        run(TrainingSpec.parse({"algorithm": "ppo", "scenarios": ["mini"], **fields}, ""), tmp_path)
+        run(TrainingStudy.parse({"algorithm": "ppo", "scenarios": ["mini"], **fields}, ""), tmp_path)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(1)
@@ -315,7 +315,7 @@ def test_a_stopped_training_goes_on_from_its_checkpoint(kind, tmp_path, monkeypa
 def test_a_finished_training_goes_on_with_more_steps(tmp_path):
     fields = {"algorithm": "ppo", "scenarios": ["mini"], "trainings": 1, "agents": []}
     fields |= {"evaluation_episodes": 4, "jobs": 1}
-    short, long = (TrainingSpec.parse({**fields, "steps": steps}, "") for steps in (600, 1_300))
+    short, long = (TrainingStudy.parse({**fields, "steps": steps}, "") for steps in (600, 1_300))
     before = run(short, tmp_path).summary["curve"]
     after = run(long, tmp_path, resume=True).summary["curve"]
     assert after[: len(before)] == before, "it goes on where it was"

@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from importlib import import_module
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -137,6 +138,13 @@ def _section(formatter: Any, heading: str) -> Any:
     return formatter.section(typer.style(heading, bold=True))
 
 
+def command_class(source: str) -> Any:
+    module, _, name = source.partition(":")
+    if name:
+        return getattr(import_module(f"parkenv.cli.{module}"), name)
+    return import_module("parkenv.cli.study_command").study_command(source)
+
+
 class _CommandPage(_Page, TyperCommand):
     """A command; its class is imported when its options are needed."""
 
@@ -146,8 +154,6 @@ class _CommandPage(_Page, TyperCommand):
 
     @cached_property
     def command_class(self) -> type[Command]:
-        from parkenv.cli.options import command_class
-
         kind: type[Command] = command_class(self.source)
         return kind
 

@@ -8,7 +8,6 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from importlib import import_module
 from keyword import iskeyword
 from pathlib import Path
 from typing import (
@@ -62,13 +61,6 @@ class Command(Spec):
 
     @abstractmethod
     def run(self) -> None: ...
-
-
-def command_class(source: str) -> Any:
-    module, _, name = source.partition(":")
-    if name:
-        return getattr(import_module(f"parkenv.cli.{module}"), name)
-    return import_module("parkenv.cli.study_command").study_command(source)
 
 
 @dataclass(frozen=True)

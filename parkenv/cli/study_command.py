@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 from pydantic import create_model
 from typer import echo
 
-from parkenv.cli.options import Command, Given, command_class, field_options, spec_of
+from parkenv.cli.options import Command, Given, field_options, spec_of
 from parkenv.cli.report import Trust, make_report, require_trust
 from parkenv.cli.tables import command_line, print_table, stages
 from parkenv.errors import nearest, require
@@ -103,7 +104,11 @@ class StudyCommand(RunCommand):
 
 def study_command(kind: str) -> type[StudyCommand]:
     study = study_class(kind)
-    base: Any = command_class(f"study_commands:{WITH_MORE[kind]}") if kind in WITH_MORE else StudyCommand
+    base: Any = (
+        getattr(import_module("parkenv.cli.study_commands"), WITH_MORE[kind])
+        if kind in WITH_MORE
+        else StudyCommand
+    )
     out = option(None, f"Folder for {study.writes}.", short="-o", default=str(study.folder({})))
     fields: Any = {"study": (study, study()), "out": (Path | None, out)}
     model: Any = create_model(study.__name__, __base__=base, __doc__=study.__doc__, **fields)

@@ -40,7 +40,7 @@ STUDIES: Mapping[str, str] = {
     "survey": "parkenv.studies.sensing.survey_study:SurveyStudy",
     "demo": "parkenv.studies.demo.study:Demo",
     "calibrate": "parkenv.studies.trips.calibration_study:CalibrationStudy",
-    "train": "parkenv.studies.training.spec:TrainingSpec",
+    "train": "parkenv.studies.training.study:TrainingStudy",
     "park": "parkenv.studies.trips.manoeuvre_study:ManoeuvreStudy",
 }
 
@@ -231,6 +231,7 @@ class Study(ExecutionSpec):
         return [rows[key] for item in cell.items for key in self.keys(cell.work, item) if key in rows]
 
     def all_rows(self, results: Results) -> list[Row]:
+        """Return the finished rows of all cells, in their order."""
         return [row for cell in self.cells() for row in self.rows_of(cell, results)]
 
     def outputs(self, results: Results, summary: Row) -> list[Task[object]]:

@@ -10,7 +10,7 @@ from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.runner import Result, run
 from parkenv.studies.sensing.survey_study import SurveyStudy
 from parkenv.studies.study import ExecutionSpec, Progress, Study
-from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.training.study import TrainingStudy
 
 _DOC = """Run a study of kind `{kind}`, as `parkenv {kind}` does.
 
@@ -52,4 +52,4 @@ compare = verb(Comparison)
 fleet = verb(FleetStudy)
 curve = verb(CurveStudy)
 survey = verb(SurveyStudy)
-train = verb(TrainingSpec)
+train = verb(TrainingStudy)

@@ -46,7 +46,7 @@ class Page(NamedTuple):
     title: str
     findings: Sequence[str] = ()  # a line each
     tables: Sequence[Mapping[str, Any]] = ()  # from `tables.table_of`
-    learning: Sequence[Mapping[str, Any]] = ()  # see `TrainingSpec.page`
+    learning: Sequence[Mapping[str, Any]] = ()  # see `TrainingStudy.page`
 
 
 def page_data(

@@ -17,7 +17,7 @@ from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.tables import Column, plural, tables_of
 from parkenv.studies.fields import TRAFFIC, ScenarioList, Values
 from parkenv.studies.fleet.setting import COLUMNS, OWN, SETTING_COLUMNS, Demanded, times_demanded
-from parkenv.studies.fleet.study import FleetSpec
+from parkenv.studies.fleet.spec import FleetSpec
 from parkenv.studies.results import Results, Row, Table
 from parkenv.studies.study import counted
 from parkenv.studies.workers import Task

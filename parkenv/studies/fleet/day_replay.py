@@ -27,7 +27,7 @@ from parkenv.world.scenario import Scenario
 from parkenv.world.tariff import PUBLIC, Zone
 
 if TYPE_CHECKING:
-    from parkenv.studies.fleet.study import FleetStudy
+    from parkenv.studies.fleet.spec import FleetSpec
 
 MOST_MAPS = 6
 LANE_WIDTH = 5.5  # m
@@ -37,18 +37,18 @@ MOST_NUMBERS = 1_500_000  # numbers of all maps of a page: with more, it would l
 Rows = Mapping[str, Sequence[Row]]  # rows of each of `TABLES`, by its file
 
 
-def map_replay(study: FleetStudy, folder: Path) -> ReplayJob:
+def map_replay(study: FleetSpec, folder: Path) -> ReplayJob:
     rows = {table.file: table.read(folder) for table in TABLES}
     return ReplayJob([partial(dict, recording) for recording in map_recordings(study, rows)])
 
 
-def write_map_page(study: FleetStudy, summary: Row, rows: Rows, folder: Path) -> None:
+def write_map_page(study: FleetSpec, summary: Row, rows: Rows, folder: Path) -> None:
     summary = without_nan(summary)
     page = page_data("fleet", study.page(summary, folder), summary, map_recordings(study, rows))
     write_page(page, folder / "fleet.html")
 
 
-def map_recordings(study: FleetStudy, rows: Rows) -> list[Recording]:
+def map_recordings(study: FleetSpec, rows: Rows) -> list[Recording]:
     shown = study.shown_settings
     settings = [*shown, *(setting for setting in study.fleet_settings if setting not in shown)][:MOST_MAPS]
     scenarios = {setting.scenario: study.built[setting.scenario] for setting in settings}
@@ -166,7 +166,7 @@ DRIVE, FAIL, QUEUE, WAIT = range(4)
 DAYS = 8  # default number of replayed days
 
 
-def day_replay(study: FleetStudy, folder: Path, options: ReportOptions) -> ReplayJob:
+def day_replay(study: FleetSpec, folder: Path, options: ReportOptions) -> ReplayJob:
     agents = options.chosen_agents([setting.agent.label for setting in study.fleet_settings])
     numbers = options.chosen_numbers(range(study.days))
     lots = [scenario.lot for scenario in study.built.values()]
@@ -193,7 +193,7 @@ def day_replay(study: FleetStudy, folder: Path, options: ReportOptions) -> Repla
     return ReplayJob([partial(record_day, study, setting, day, totals) for setting, day in chosen], notes)
 
 
-def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[Key, float]) -> Recording:
+def record_day(study: FleetSpec, setting: Setting, day: int, counted: Mapping[Key, float]) -> Recording:
     fleet, agents = study.fleet(setting)
     scenario = fleet.scenario
     fleet.keep_steps()
@@ -233,7 +233,7 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
 
 
 def choose_days(
-    study: FleetStudy, settings: Sequence[Setting], count: int, days: Sequence[int] | None = None
+    study: FleetSpec, settings: Sequence[Setting], count: int, days: Sequence[int] | None = None
 ) -> list[tuple[Setting, int]]:
     """Return all of some `days`, or so many: the first day of each setting, then the next one."""
     numbers = range(study.days) if days is None else days
