@@ -31,7 +31,7 @@ COMMANDS = {
     "train": Entry("Train agents by reinforcement learning.", "train", START),
     "play": Entry("Play the search yourself, in the worlds of the agents.", "report:Play", START),
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", START),
-    "run": Entry("Run an experiment file.", "study_command:Run", START),
+    "run": Entry("Run an experiment file.", "run:Run", START),
     "plan": Entry(
         "Draw planned searches, as in Fig. 4.9 to 4.12 of the thesis.", "study_commands:Plan", AGENTS
     ),
@@ -57,9 +57,7 @@ COMMANDS = {
     "fleet": Entry("Simulate many cars that search at the same time.", "fleet", PLACES),
     "commute": Entry("Simulate daily commuters with a map that learns.", "commute", PLACES),
     "curve": Entry("Fit search time and walk as functions of occupancy.", "curve", PLACES),
-    "schema": Entry(
-        "Print the JSON schema of a kind of file, or write all schemas.", "study_command:Schema", PLACES
-    ),
+    "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "run:Schema", PLACES),
     "map-drive": Entry("Make a map from a recorded drive, photographs or a film.", "sensing:MapDrive", SENSE),
     "detect": Entry("Find cars in photographs, videos and recorded drives.", "detect:Detect", SENSE),
     "survey": Entry("Drive past every slot, and map which are taken.", "survey", SENSE),

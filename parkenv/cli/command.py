@@ -142,7 +142,7 @@ def command_class(source: str) -> Any:
     module, _, name = source.partition(":")
     if name:
         return getattr(import_module(f"parkenv.cli.{module}"), name)
-    return import_module("parkenv.cli.study_command").study_command(source)
+    return import_module("parkenv.cli.run").study_command(source)
 
 
 class _CommandPage(_Page, TyperCommand):
