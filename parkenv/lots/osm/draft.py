@@ -47,11 +47,12 @@ from parkenv.lots.osm.parking import (
     CrossedOutlineError,
     Junctions,
     areas_of,
-    corridor_of,
+    corridors_of,
     exterior_rings,
     fill_outline,
     find_goals,
     is_building,
+    is_clear,
     is_parking_area,
     is_space,
     kerb_of,
@@ -286,18 +287,15 @@ class _LotImport(MapImport):
         if not any(road.has_kerb_parking for road in self.roads):
             return
         junctions = Junctions(self.roads, self.crossings())
-        corridors = corridor_of(self.roads)
+        corridors = corridors_of(self.roads)
         for k, road in enumerate(self.roads):
             for side in SIDES:
-                tagged = road.side_of_way(side)
-                kerb = kerb_of(road.tags, tagged)
-                if isinstance(kerb, str):
-                    self.left_out[kerb].append(f"{road.id}-{tagged}")
-                if kerb is None or isinstance(kerb, str):
+                kerb = kerb_of(road, side, self.left_out)
+                if kerb is None:
                     continue
-                note_other_keys(road.tags)
+                tagged = road.side_of_way(side)
                 slots = kerb_slots(road, side, kerb, junctions.closed_intervals(k, side))
-                slots = slots[~shapely.intersects(corridors, slots.boxes(shrink=0.05))]
+                slots = slots[is_clear(slots, corridors, 0.05)]
                 self._add_row(KERBSIDE, road.id, f"{road.id}-{tagged}", slots, road.rank)
                 if kerb.capacity is not None and len(slots) < kerb.capacity:
                     self.notes.append(

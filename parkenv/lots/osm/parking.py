@@ -25,7 +25,7 @@ from parkenv.lots.generators import (
     slots_from_polygons,
 )
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.conditions import FORBIDDEN, kerb_tag, kerb_users, users_of
+from parkenv.lots.osm.conditions import FORBIDDEN, kerb_tag, kerb_users, note_other_keys, users_of
 from parkenv.lots.osm.elements import OsmElement
 from parkenv.lots.osm.roads import (
     SIDES,
@@ -39,7 +39,7 @@ from parkenv.lots.osm.roads import (
     whole_number,
 )
 from parkenv.lots.unread import note_unread
-from parkenv.world.drive_graph import SLOT_REACH, node_labels
+from parkenv.world.drive_graph import SLOT_REACH, linestrings, node_labels
 from parkenv.world.lot import Lane, Mouth
 from parkenv.world.tariff import PUBLIC
 
@@ -153,11 +153,14 @@ class Kerb:
     on_carriageway: bool  # whether parked cars are within `width`
 
 
-def kerb_of(tags: Mapping[str, str], side: Side, *, reserved: bool = False) -> Kerb | str | None:
-    """Return the parking on one side of a way; a reason if tagged but unusable; None without tags.
+def kerb_of(
+    road: Road, side: Side, left_out: Mapping[str, list[str]], *, reserved: bool = False
+) -> Kerb | None:
+    """Return the tagged parking on one side of a road; None without tags, or if they are unusable, which is listed.
 
     With `reserved`, kerbs for a class of users are usable, too.
     """
+    tags, side = road.tags, road.side_of_way(side)
     key, lane = kerb_tag(tags, "parking:{}", side), kerb_tag(tags, "parking:lane:{}", side)
     kind, old = tags.get(key), tags.get(lane)
     if kind in ("no", "separate") or (
@@ -170,7 +173,8 @@ def kerb_of(tags: Mapping[str, str], side: Side, *, reserved: bool = False) -> K
     if orientation not in ARRANGEMENTS or (kind is not None and kind not in PARKED):
         note_unread(tags, lane if kind is None else key, "no parking")
         named = f"parking:lane={old}" if kind is None else f"parking={kind}, orientation={orientation}"
-        return f"kerbs with {named}, which is not known"
+        left_out[f"kerbs with {named}, which is not known"].append(f"{road.id}-{side}")
+        return None
     users, minutes = kerb_users(tags, side)
     if users == FORBIDDEN or not minutes.any() or (users != PUBLIC and not reserved):
         new = {"restriction=": "parking:{}:restriction", "access=": "parking:{}:access"}
@@ -180,7 +184,9 @@ def kerb_of(tags: Mapping[str, str], side: Side, *, reserved: bool = False) -> K
         closed = (
             f"{name.strip()}{value}" for name, value in reasons if users_of(value) not in (PUBLIC, None)
         )
-        return f"kerbs with {next(closed, 'rules that forbid parking')}"
+        left_out[f"kerbs with {next(closed, 'rules that forbid parking')}"].append(f"{road.id}-{side}")
+        return None
+    note_other_keys(tags)
     counted = ("parking:{}:capacity",) if kind else ("parking:lane:{}:capacity", "parking:{}:capacity")
     counts = (count_in(tags, kerb_tag(tags, text, side), "by the length of the kerb") for text in counted)
     capacity = next((count for count in counts if count is not None), None)
@@ -294,12 +300,17 @@ PHASES = (0.0, 0.25, 0.5, 0.75)
 CORRIDOR = 0.8  # fraction of a road's half width that must be clear of slots of other roads
 
 
-def corridor_of(roads: Sequence[Road], blocked: Sequence[shapely.Geometry] = ()) -> shapely.Geometry:
-    """Return what of roads must be clear of slots, and what is blocked besides, prepared for many tests."""
-    ways = [(shapely.LineString(road.points), CORRIDOR * road.half_width) for road in roads]
-    taken = shapely.union_all([*(line.buffer(width, cap_style="flat") for line, width in ways), *blocked])
-    shapely.prepare(taken)
-    return taken
+def corridors_of(roads: Sequence[Road], blocked: Sequence[shapely.Geometry] = ()) -> shapely.STRtree:
+    """Return what of roads must be clear of slots, and what is blocked besides."""
+    widths = [CORRIDOR * road.half_width for road in roads]
+    corridors = shapely.buffer(linestrings([road.points for road in roads]), widths, cap_style="flat")
+    return shapely.STRtree([*corridors, *blocked])
+
+
+def is_clear(slots: Slots, taken: shapely.STRtree, shrink: float) -> BoolArray:
+    """Return which slots, made smaller by `shrink` m, meet nothing that is taken, (n,)."""
+    met = taken.query(slots.boxes(shrink), predicate="intersects")[0]
+    return ~np.isin(np.arange(len(slots)), met)
 
 
 def fill_outline(
@@ -317,7 +328,7 @@ def fill_outline(
     if not roads:
         return NO_SLOTS
     lines = np.array([shapely.LineString(road.points) for road in roads])
-    taken = corridor_of(roads, blocked)
+    taken = corridors_of(roads, blocked)
     roomy = shapely.buffer(outline, OUTLINE_TOLERANCE)
     shapely.prepare(roomy)
 
@@ -363,12 +374,11 @@ def _row(
 
 
 def _fitting(
-    slots: Slots, roomy: shapely.Geometry, taken: shapely.Geometry, lines: NDArray[np.object_], own: int
+    slots: Slots, roomy: shapely.Geometry, taken: shapely.STRtree, lines: NDArray[np.object_], own: int
 ) -> Slots:
     if not len(slots):
         return slots
-    boxes = slots.boxes(shrink=0.02)
-    fits = shapely.covers(roomy, boxes) & ~shapely.intersects(taken, boxes)
+    fits = shapely.covers(roomy, slots.boxes(shrink=0.02)) & is_clear(slots, taken, 0.02)
     mouth = slots.mouths()
     distance = shapely.distance(np.asarray(shapely.points(mouth))[:, None], lines[None])
     fits &= distance[:, own] <= np.minimum(distance.min(axis=1) + 1e-6, SLOT_REACH)

@@ -46,10 +46,11 @@ from parkenv.lots.osm.draft import (
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.parking import (
     CAR_SPACES,
-    CORRIDOR,
     Area,
+    corridors_of,
     exterior_rings,
     is_building,
+    is_clear,
     is_parking_area,
     is_space,
     without_overlaps,
@@ -248,8 +249,6 @@ class _TownImport(MapImport):
         self.used |= {k for k, side in drawn.items() if side is not None}
         sides = list(filter(None, drawn.values()))
         sides += supply.kerb_sides(self.roads, self.crossings(), self.buildings, self.left_out, untagged)
-        half_widths = [CORRIDOR * road.half_width for road in self.roads]
-        corridors = shapely.buffer(self.lines, half_widths, cap_style="flat")
         # Several runs of one way are one kerb.
         whole: dict[str, supply.FacilityRow] = {}
         for side in sides:
@@ -262,10 +261,9 @@ class _TownImport(MapImport):
         rows = list(whole.values())
         slots = Slots.joined([row.slots for row in rows] or [NO_SLOTS])
         of = np.repeat(np.arange(len(rows)), [len(row.slots) for row in rows])
-        on_street = shapely.STRtree(corridors).query(slots.boxes(shrink=0.05), predicate="intersects")[0]
         others = Slots.joined([*(row.slots for row in self.rows), NO_SLOTS])
         boxes = np.concatenate([others.boxes(MAPPED_OVERLAP), slots.boxes(RULE_OVERLAP)])
-        is_free = without_overlaps(boxes)[len(others) :] & ~np.isin(np.arange(len(slots)), on_street)
+        is_free = without_overlaps(boxes)[len(others) :] & is_clear(slots, corridors_of(self.roads), 0.05)
         lost = np.bincount(of[~is_free], minlength=len(rows))
         self.left_out["kerbs with fewer places, because of streets and other places"] += [
             rows[k].element for k in np.flatnonzero(lost).tolist()

@@ -44,7 +44,6 @@ from parkenv.lots.osm.conditions import (
     kerb_conditions,
     kerb_tag,
     kerb_users,
-    note_other_keys,
     opening,
     parking_users,
     week_of,
@@ -488,12 +487,9 @@ def kerb_sides(
             closed = everything.closed_intervals(k, side)
             source, rule, capacity = "rule", CLASS_RULE, None
             if by_tag:
-                kerb = kerb_of(road.tags, tagged, reserved=True)
-                if isinstance(kerb, str):
-                    left_out[kerb].append(f"{road.id}-{tagged}")
-                if kerb is None or isinstance(kerb, str):
+                kerb = kerb_of(road, side, left_out, reserved=True)
+                if kerb is None:
                     continue
-                note_other_keys(road.tags)
                 capacity, source, rule = kerb.capacity, "tag", ""
                 if capacity is None:
                     free = sum(end - start for start, end in free_intervals(total, closed))
