@@ -69,7 +69,7 @@ def test_only_streets_that_cars_need_are_left_and_no_way_is_longer(tmp_path):
     (tmp_path / "town.osm").write_text(place.xml(), encoding="utf-8")
     elements = read_map(tmp_path / "town.osm").elements
     lines = [line for one in elements if "highway" in one.tags for line in one.lines]
-    streets, _ = read_streets(elements, LocalFrame.around(np.concatenate(lines)), left_hand=False)
+    streets = read_streets(elements, LocalFrame.around(np.concatenate(lines)), {}, left_hand=False)
     entries, _ = streets.entries()
     doors = np.array([streets.points(piece).mean(axis=0) + 3.0 for piece in (1, 6, 10, 13)])
     facilities = tuple(Facility(f"P{k}", capacity=9, xy=tuple(xy)) for k, xy in enumerate(doors.tolist()))

@@ -27,9 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, naming, require
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
 from parkenv.lots.generators import NO_SLOTS, Slots
@@ -123,7 +122,7 @@ def draft_of_map(
     has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
     ways = (e for e in elements if not e.is_node)
     if has_spaces and not any(isinstance(road_of(e.id, e.tags, e.lines[0] * 1e5), Road) for e in ways):
-        return outline_draft(name, elements, [], frame or map_frame(elements), options)
+        return outline_draft(MapImport(name, place, frame or map_frame(elements)), [], options)
     importer = _LotImport(name, place, options, frame)
     importer.read_spaces()
     importer.fill_outlines()
@@ -133,7 +132,7 @@ def draft_of_map(
     if has_spaces and incomplete and (options.guess_entry or options.guess_goal):
         edge = importer._edge(draft.slots)
         roads = [part for road in importer.roads for part in clipped_road(road, edge)]
-        return outline_draft(name, elements, roads, importer.frame, options)
+        return outline_draft(MapImport(name, place, importer.frame), roads, options)
     return draft
 
 
@@ -150,6 +149,8 @@ class _Part(NamedTuple):
 
 
 class MapImport:
+    """What lots and towns read of a map alike: its areas, its points, slots of drawn spaces, and what is left out."""
+
     def __init__(self, name: str, place: OsmMap, frame: LocalFrame) -> None:
         self.name, self.place, self.frame = name, place, frame
         self.left_out: dict[str, list[str]] = defaultdict(list)
@@ -170,22 +171,28 @@ class MapImport:
         positions = (e.lines[0] for e in self.nodes if wanted(e))
         return self.frame.to_xy(np.concatenate([np.empty((0, 2)), *positions]))
 
+    def goals(
+        self, slots: Slots, buildings: Sequence[Area], options: ImportOptions
+    ) -> tuple[FloatArray, str]:
+        """Return the goals of a lot, (n, 2) m, and where they come from, unless they are given."""
+        given = points_in_frame(self.frame, options.goals)
+        return (given, "") if len(given) else find_goals(slots, self.nodes, buildings, self.frame)
+
     def drawn_slots(
         self, spaces: Sequence[Area], lanes: Sequence[Lane], roads: Sequence[Road]
-    ) -> tuple[list[_Part], list[tuple[Rank, NDArray[np.intp], Slots]]]:
+    ) -> tuple[list[_Part], IntArray, list[Rank], Slots]:
+        """Return the places of spaces, and the slots of those that a road reaches: index, rank of the road."""
         parts = [
             _Part(area, name, polygon)
             for area in spaces
             for name, polygon in split_space(area.element, to_rectangle(area.polygon), lanes)
         ]
-        if not parts:
-            return [], []
-        by_rank = list(slots_by_rank(np.array([part.polygon for part in parts], dtype=np.object_), roads))
-        left = np.ones(len(parts), bool)
-        for _, index, _ in by_rank:
-            left[index] = False
-        self.left_out[NO_AISLE] += [parts[i].name for i in np.flatnonzero(left).tolist()]
-        return parts, by_rank
+        index, ranks, slots = slots_by_rank(
+            np.array([part.polygon for part in parts], dtype=np.object_), roads
+        )
+        left = np.setdiff1d(np.arange(len(parts)), index)
+        self.left_out[NO_AISLE] += [parts[i].name for i in left.tolist()]
+        return parts, index, ranks, slots
 
 
 class _Slot(NamedTuple):
@@ -232,15 +239,12 @@ class _LotImport(MapImport):
     # ---- slots ----
 
     def read_spaces(self) -> None:
-        usable, unused = usable_spaces(self.spaces, self.outlines)
-        for area, reason in unused:
-            self.left_out[reason].append(area.element.id)
-        self.blocked += [area.polygon for area in (*(area for area, _ in unused), *usable)]
-        spaces, by_rank = self.drawn_slots(usable, lanes_of(self.roads), self.roads)
-        for rank, index, slots in by_rank:
-            drawn = [spaces[i] for i in index.tolist()]
-            self.slots += [_Slot(MAPPED, space.area.element.id, space.name, rank) for space in drawn]
-            self.parts.append(slots)
+        usable, unused = usable_spaces(self.spaces, self.outlines, self.left_out)
+        self.blocked += [area.polygon for area in (*unused, *usable)]
+        spaces, index, ranks, slots = self.drawn_slots(usable, lanes_of(self.roads), self.roads)
+        drawn = zip([spaces[i] for i in index.tolist()], ranks, strict=True)
+        self.slots += [_Slot(MAPPED, space.area.element.id, space.name, rank) for space, rank in drawn]
+        self.parts.append(slots)
 
     def fill_outlines(self) -> None:
         centers = shapely.points(np.concatenate([np.empty((0, 2)), *(slots.xy for slots in self.parts)]))
@@ -323,9 +327,7 @@ class _LotImport(MapImport):
                 if edge is None
                 else open_ends(roads, edge, self.points(is_blind))
             )
-        goals, goal_note = points_in_frame(self.frame, self.options.goals), None
-        if not len(goals):
-            goals, goal_note = find_goals(slots, self.nodes, self.buildings, self.frame)
+        goals, goal_note = self.goals(slots, self.buildings, self.options)
         walls, passages = split_walls(slots, roads, self.buildings)
         self.left_out["buildings over slots or lanes, which are no walls"] += passages
 
@@ -353,9 +355,7 @@ class _LotImport(MapImport):
         )
 
     def _without_overlaps(self) -> tuple[list[_Slot], Slots]:
-        if not self.slots:
-            return [], NO_SLOTS
-        slots = Slots.joined(self.parts)
+        slots = Slots.joined([*self.parts, NO_SLOTS])
         shrink = np.where([slot.source == MAPPED for slot in self.slots], MAPPED_OVERLAP, RULE_OVERLAP)
         is_free = without_overlaps(slots.boxes(shrink))
         self.left_out["slots that overlap others"] += [
@@ -390,7 +390,7 @@ class _LotImport(MapImport):
                 f"{BUILDING_REACH:g} m; give the place that people walk to by --goal LAT,LON"
             )
 
-    def _found(self, draft: LotDraft, roads: Sequence[Road], goal_note: str | None) -> Iterable[str]:
+    def _found(self, draft: LotDraft, roads: Sequence[Road], goal_note: str) -> Iterable[str]:
         for source in (MAPPED, FILLED, KERBSIDE):
             owner_of = {slot.id: slot.owner for slot in self.slots if slot.source == source}
             owners = [owner_of[name] for name in draft.slot_ids if name in owner_of]
@@ -441,61 +441,46 @@ def refuse_far_away(elements: Sequence[OsmElement]) -> None:
 MOST_SPACES = 20_000  # maximum number of spaces of one lot
 
 
-def outline_draft(
-    name: str,
-    elements: Sequence[OsmElement],
-    roads: Sequence[Road],
-    frame: LocalFrame,
-    options: ImportOptions,
-) -> LotDraft:
+def outline_draft(of: MapImport, roads: Sequence[Road], options: ImportOptions) -> LotDraft:
     """Draft a lot from the outlines of its spaces; `parkenv.lots.infer.layout` has the rules."""
-    drawn = [e for e in elements if is_space(e)]
+    drawn = [e for e in of.place.elements if is_space(e)]
     require(
         len(drawn) <= MOST_SPACES,
         f"{len(drawn):,} parking spaces, want at most {MOST_SPACES:,} in one lot; divide it by --split or --bounds",
     )
-    readable, crossing = list[Area](), list[str]()
+    readable, crossing = list[Area](), of.left_out["outlines that cross themselves"]
     for element in drawn:
         try:
-            readable.append(Area.of(element, frame, simple=True))
-        except CrossedOutlineError as error:
+            readable.append(Area.of(element, of.frame, simple=True))
+        except CrossedOutlineError:
             crossing.append(element.id)
             if len(crossing) == len(drawn):
-                raise error from None
-    areas = within(readable, options.box(frame))
+                raise
+    areas = within(readable, options.box(of.frame))
     _refuse_swapped(areas)
     validate_areas(
         [a.element.id for a in areas], shapely.area(np.array([a.polygon for a in areas], dtype=object))
     )
-    buildings, parking = (
-        [a for a in areas_of(elements, frame, wanted, mended=True) if shapely.area(a.polygon)]
-        for wanted in (is_building, is_parking_area)
-    )
-    kept, unused = usable_spaces(areas, parking)
-    left_out = {"outlines that cross themselves": crossing}
-    for area, reason in unused:
-        left_out.setdefault(reason, []).append(area.element.id)
+    buildings, parking = (of.areas(wanted, mended=True) for wanted in (is_building, is_parking_area))
+    kept, unused = usable_spaces(areas, parking, of.left_out)
     if not kept:
-        raise InputError(f"no parking space for cars: {'; '.join(map(str, LeftOut.by_reason(left_out)))}")
+        raise InputError(f"no parking space for cars: {'; '.join(map(str, LeftOut.by_reason(of.left_out)))}")
     ids, polygons = zip(*(part for a in kept for part in split_space(a.element, a.polygon, [])), strict=True)
     spaces = spaces_from_outlines(ids, np.array(polygons, dtype=object))
-    obstacles = [*(a.polygon for a in buildings), *(a.polygon for a, _ in unused)]
-    entries, goals = (points_in_frame(frame, given) for given in (options.entries, options.goals))
+    obstacles = [a.polygon for a in (*buildings, *unused)]
     lines = [Line(road.points, road.oneway, STREET if road.rank is Rank.STREET else -1) for road in roads]
-    lot = infer_lot(spaces, obstacles, lines, entries)
-    goal_note: str | None = None
-    if not len(goals):
-        goals, goal_note = find_goals(lot.slots, [e for e in elements if e.is_node], buildings, frame)
+    lot = infer_lot(spaces, obstacles, lines, points_in_frame(of.frame, options.entries))
+    goals, goal_note = of.goals(lot.slots, buildings, options)
     draft = draft_inferred_lot(
-        name,
+        of.name,
         lot,
         spaces,
         options,
         source=MAPPED,
-        left_out=left_out,
-        frame=frame,
+        left_out=of.left_out,
+        frame=of.frame,
         goals=goals,
-        goal_note=goal_note or "",
+        goal_note=goal_note,
     )
     return replace(
         draft,

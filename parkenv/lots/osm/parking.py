@@ -462,11 +462,11 @@ def exterior_rings(polygons: Iterable[shapely.Geometry]) -> list[FloatArray]:
 
 def find_goals(
     slots: Slots, nodes: Sequence[OsmElement], buildings: Sequence[Area], frame: LocalFrame
-) -> tuple[FloatArray, str | None]:
+) -> tuple[FloatArray, str]:
     """Return entrances near the slots, main ones first, else the middle of the nearest building, (n, 2) m; a note."""
     none = np.empty((0, 2))
     if not len(slots):
-        return none, None
+        return none, ""
     doors = [e for e in nodes if e.tags.get("entrance", "no") not in NOT_GOALS]
     if doors:
         xy = frame.to_xy(np.concatenate([e.lines[0] for e in doors]))
@@ -483,7 +483,7 @@ def find_goals(
         if distance[k] <= BUILDING_REACH:
             middle = shapely.get_coordinates(shapely.centroid(buildings[k].polygon))
             return middle, f"the middle of the nearest building, {buildings[k].element.id}"
-    return none, None
+    return none, ""
 
 
 def split_walls(
@@ -524,11 +524,17 @@ def is_parking_area(element: OsmElement) -> bool:
 
 
 def usable_spaces(
-    spaces: Sequence[Area], parking: Sequence[Area]
-) -> tuple[list[Area], list[tuple[Area, str]]]:
+    spaces: Sequence[Area], parking: Sequence[Area], left_out: Mapping[str, list[str]]
+) -> tuple[list[Area], list[Area]]:
+    """Return the spaces that are slots, and the others, which are listed."""
     private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
-    judged = [(a, _why_no_slot(a, private)) for a in spaces]
-    return [a for a, why in judged if why is None], [(a, why) for a, why in judged if why is not None]
+    usable, others = list[Area](), list[Area]()
+    for space in spaces:
+        reason = _why_no_slot(space, private)
+        (others if reason else usable).append(space)
+        if reason:
+            left_out[reason].append(space.element.id)
+    return usable, others
 
 
 def _why_no_slot(space: Area, private: Sequence[shapely.Geometry]) -> str | None:
@@ -549,10 +555,9 @@ def _why_no_slot(space: Area, private: Sequence[shapely.Geometry]) -> str | None
     return next((reason for reason, holds in reasons.items() if holds), None)
 
 
-def slots_by_rank(
-    polygons: NDArray[np.object_], roads: Sequence[Road]
-) -> Iterator[tuple[Rank, NDArray[np.intp], Slots]]:
-    """Yield slots by the rank of the road that they open to, with their indices; lower ranks win, even if farther."""
+def slots_by_rank(polygons: NDArray[np.object_], roads: Sequence[Road]) -> tuple[IntArray, list[Rank], Slots]:
+    """Return slots by the rank of the road that they open to, with their indices; lower ranks win, even if farther."""
+    index, ranks, parts = [np.empty(0, np.int64)], list[Rank](), [NO_SLOTS]
     left = np.arange(len(polygons))
     for rank in Rank:
         near = [Lane(road.points, road.oneway) for road in roads if road.rank <= rank]
@@ -561,8 +566,11 @@ def slots_by_rank(
         slots = slots_from_polygons(polygons[left], near)
         to_lane = nearest_on_lanes(near, slots.mouths())[0] - slots.mouths()
         reached = np.hypot(to_lane[:, 0], to_lane[:, 1]) <= SLOT_REACH
-        yield rank, left[reached], slots[reached]
+        index.append(left[reached])
+        ranks += [rank] * len(index[-1])
+        parts.append(slots[reached])
         left = left[~reached]
+    return np.concatenate(index), ranks, Slots.joined(parts)
 
 
 def split_space(

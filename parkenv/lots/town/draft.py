@@ -55,13 +55,12 @@ from parkenv.lots.osm.parking import (
     is_space,
     without_overlaps,
 )
-from parkenv.lots.osm.roads import Rank, Road, Turns, count_in, off_the_ground, turns_of
+from parkenv.lots.osm.roads import Rank, Road, Turns, count_in, lanes_of, off_the_ground, turns_of
 from parkenv.lots.town import supply
 from parkenv.lots.town.streets import BEYOND, read_streets
 from parkenv.lots.unread import Unread, noting_unread, unread_rows
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_KINDS, FACILITY_REACH
-from parkenv.world.lot import Lane
 from parkenv.world.tariff import PUBLIC
 
 ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
@@ -158,8 +157,8 @@ class _TownImport(MapImport):
         refuse_far_away(streets)
         frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
         super().__init__(name, replace(place, elements=elements), frame)
+        self.streets = read_streets(elements, self.frame, self.left_out, left_hand=left_hand)
         self.left_out["car parks mapped as a point, too, within their outlines"] += merged
-        self.streets, self.closed_roads = read_streets(elements, self.frame, left_hand)
         self.roads = self.streets.roads_of(self.streets.kept)
         self.lines = linestrings([road.points for road in self.roads])
         self.tree = shapely.STRtree(self.lines)
@@ -206,30 +205,24 @@ class _TownImport(MapImport):
                 spaces.append(area)
             else:
                 self.left_out[f"spaces with {reason}"].append(area.element.id)
-        lanes = [Lane(road.points, road.oneway) for road in self.roads if road.rank < Rank.STREET]
-        parts, by_rank = self.drawn_slots(spaces, lanes, self.roads)
+        lanes = lanes_of([road for road in self.roads if road.rank < Rank.STREET])
+        parts, index, _, slots = self.drawn_slots(spaces, lanes, self.roads)
         if not parts:
             return
         polygons = np.array([part.polygon for part in parts], dtype=np.object_)
         owner = _car_parks_of(polygons, self.parking)
-        groups: dict[int, tuple[list[Slots], list[supply.Rules]]] = defaultdict(lambda: ([], []))
-        for _, index, slots in by_rank:
-            for k in np.unique(owner[index]).tolist():
-                is_own = owner[index] == k
-                groups[k][0].append(slots[is_own])
-                groups[k][1].extend(
-                    supply.rules_of(parts[i].area.element.tags) for i in index[is_own].tolist()
-                )
+        groups = np.unique(owner[index]).tolist()
         self.used = {k for k in groups if k < len(self.parking)}
-        for k, (drawn, rules) in sorted(groups.items()):
+        for k in groups:
             around = self.parking[k] if k in self.used else parts[int(np.flatnonzero(owner == k)[0])].area
             inside = around.element
             whole = supply.rules_of(inside.tags) if k in self.used else supply.Rules()
             row = supply.FacilityRow(
                 self._named(inside.tags, inside.id), "lot", whole, "drawn", "", inside.id
             )
-            row.slots = Slots.joined(drawn)
+            row.slots = slots[owner[index] == k]
             # A space without rules of its own has those of its car park.
+            rules = (supply.rules_of(parts[i].area.element.tags) for i in index[owner[index] == k].tolist())
             row.slot_rules = [own if own != supply.Rules() else whole for own in rules]
             row.tagged = count_in(inside.tags, "capacity", "the drawn places") if k in self.used else None
             more = (row.tagged or 0) - len(row.slots)
@@ -433,8 +426,6 @@ class _TownImport(MapImport):
         rows = supply.table_of(self.rows, draft)
         left_out = (
             *self.place.left_out,
-            *self.closed_roads,
-            *self.streets.unconnected(),
             *LeftOut.by_reason(self.left_out),
             *turns.left_out,
             *draft.left_out,

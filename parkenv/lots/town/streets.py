@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, dijk
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import require
-from parkenv.lots.draft import LeftOut
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import OsmElement
@@ -98,11 +97,11 @@ class Streets:
         points: FloatArray = self.roads[self.road[piece]].points[first : last + 1]
         return points
 
-    def unconnected(self) -> tuple[LeftOut, ...]:
+    def unconnected(self) -> list[str]:
+        """Return the names of streets that are not kept, the longest first."""
         alone = np.flatnonzero(~self.kept)
         roads = [self.roads[k] for k in self.road[alone[np.argsort(-self.length[alone])]].tolist()]
-        names = dict.fromkeys(road.tags.get("name", road.id) for road in roads)
-        return LeftOut.by_reason({"streets that are not connected to the others": names})
+        return list(dict.fromkeys(road.tags.get("name", road.id) for road in roads))
 
     def _edge(self) -> tuple[FloatArray, BoolArray, BoolArray]:
         """Return where streets leave the map: their traffic, 0 elsewhere, whether cars come in, and leave, (n_nodes,).
@@ -284,11 +283,12 @@ def _joined(lanes: Sequence[Lane], mouths: FloatArray) -> list[Lane]:
 
 
 def read_streets(
-    elements: Sequence[OsmElement], frame: LocalFrame, left_hand: bool
-) -> tuple[Streets, tuple[LeftOut, ...]]:
-    left_out: dict[str, list[str]] = {}
+    elements: Sequence[OsmElement], frame: LocalFrame, left_out: dict[str, list[str]], *, left_hand: bool
+) -> Streets:
     roads = read_roads(elements, frame, left_out, town=True, left_hand=left_hand)
     blind = frame.to_xy([e.lines[0][0] for e in barriers_of(elements)])
     cut = frozenset(element.id for element in elements if element.cut)
     beyond = Streets(tuple(roads), cut, blind).ways_beyond()
-    return Streets((*roads, *beyond), cut, blind), LeftOut.by_reason(left_out)
+    streets = Streets((*roads, *beyond), cut, blind)
+    left_out["streets that are not connected to the others"] = streets.unconnected()
+    return streets
