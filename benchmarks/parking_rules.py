@@ -25,7 +25,7 @@ from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import read_map
-from parkenv.lots.osm.parking import Junctions, areas_of, free_intervals, is_parking_area
+from parkenv.lots.osm.parking import Junctions, areas_of, is_parking_area
 from parkenv.lots.osm.roads import Road, road_of, whole_number
 from parkenv.lots.town.supply import KINDS, PLACES_PER_METRE, RULES, levels_of, rule_of
 from parkenv.world.drive_graph import linestrings
@@ -52,10 +52,9 @@ def kerb_table(folder: Path) -> tuple[list[Road], FloatArray, FloatArray]:
             known.append(own["error_output"] is None)
     junctions = Junctions(every, np.empty((0, 2)))
     free = np.zeros(len(every))
-    for k, road in enumerate(every):
-        total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
+    for k in range(len(every)):
         for side in ("left", "right"):
-            free[k] += sum(b - a for a, b in free_intervals(total, junctions.closed_intervals(k, side)))
+            free[k] += sum(b - a for a, b in junctions.free_intervals(k, side))
     names = np.array([road.tags.get("name", "") for road in every])
     shapes = linestrings([road.points for road in every])
     # A kerb may stand beside several ways of its street: each of its points belongs to the nearest one of its name.

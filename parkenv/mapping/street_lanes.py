@@ -15,7 +15,7 @@ from parkenv.lots.generators import Slots, nearest_on_lanes
 from parkenv.lots.infer.network import Line, limit_junctions, noded
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import read_map
-from parkenv.lots.osm.roads import clipped_road, read_roads
+from parkenv.lots.osm.roads import clipped_roads, read_roads
 from parkenv.mapping.street_slots import GAP, LONE_CAR, StreetSlots
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, node_labels
 from parkenv.world.lot import Lane, ParkingLot
@@ -98,7 +98,7 @@ def mapped_lanes(file: Path, frame: LocalFrame, tracks: Sequence[FloatArray]) ->
     with naming(file):
         roads = read_roads(read_map(file).elements, frame, {})
         around = path.buffer(_STREETS_AROUND_M)
-        lines = [Line(part.points, part.oneway) for road in roads for part in clipped_road(road, around)]
+        lines = [Line(part.points, part.oneway) for part in clipped_roads(roads, around)]
         pieces = noded(lines) if lines else []
         shapes = [shapely.LineString(piece.points) for piece in pieces]
         driven = np.array([path.buffer(_NEAR_M).intersection(shape).length for shape in shapes])

@@ -67,7 +67,7 @@ from parkenv.lots.osm.roads import (
     SIDES,
     Rank,
     Road,
-    clipped_road,
+    clipped_roads,
     closed_to_cars,
     components_with_slots,
     count_in,
@@ -130,8 +130,7 @@ def draft_of_map(
     draft = importer.draft()
     incomplete = bool(draft.missing) or any(left.reason == NO_AISLE for left in draft.left_out)
     if has_spaces and incomplete and (options.guess_entry or options.guess_goal):
-        edge = importer._edge(draft.slots)
-        roads = [part for road in importer.roads for part in clipped_road(road, edge)]
+        roads = clipped_roads(importer.roads, importer.edge(draft.slots))
         return outline_draft(MapImport(name, place, importer.frame), roads, options)
     return draft
 
@@ -216,8 +215,7 @@ class _LotImport(MapImport):
         self.notes: list[str] = []
         self.roads = read_roads(place.elements, self.frame, self.left_out, left_hand=options.left_hand)
         if self.box is not None:
-            box = shapely.box(*self.box)
-            self.roads = [part for road in self.roads for part in clipped_road(road, box)]
+            self.roads = clipped_roads(self.roads, shapely.box(*self.box))
         self.outlines, self.spaces, self.buildings = (
             within(self.areas(wanted), self.box) for wanted in (is_parking_area, is_space, is_building)
         )
@@ -298,7 +296,7 @@ class _LotImport(MapImport):
                 if kerb is None:
                     continue
                 tagged = road.side_of_way(side)
-                slots = kerb_slots(road, side, kerb, junctions.closed_intervals(k, side))
+                slots = kerb_slots(road, side, kerb, junctions.free_intervals(k, side))
                 slots = slots[is_clear(slots, corridors, 0.05)]
                 self._add_row(KERBSIDE, road.id, f"{road.id}-{tagged}", slots, road.rank)
                 if kerb.capacity is not None and len(slots) < kerb.capacity:
@@ -315,18 +313,15 @@ class _LotImport(MapImport):
         # Streets are lanes, too, where slots open to them or they connect the service roads.
         on_street = any(slot.rank == Rank.STREET for slot in sources)
         is_apart = len(slots) > 0 and len(components_with_slots(service, slots)) > 1
-        edge = self._edge(slots) if on_street or is_apart else None
-        if edge is None:
-            roads = used_roads(service, streets, slots)
+        if on_street or is_apart:
+            edge = self.edge(slots)
+            roads = used_roads(clipped_roads(self.roads, edge), [], slots)
+            ways_in = open_ends(roads, edge, self.points(is_blind))
         else:
-            roads = used_roads([part for road in self.roads for part in clipped_road(road, edge)], [], slots)
-        entries = points_in_frame(self.frame, self.options.entries)
-        if not len(entries) and roads:
-            entries = (
-                street_junctions(roads, streets)
-                if edge is None
-                else open_ends(roads, edge, self.points(is_blind))
-            )
+            roads = used_roads(service, streets, slots)
+            ways_in = street_junctions(roads, streets)
+        given = points_in_frame(self.frame, self.options.entries)
+        entries = given if len(given) else ways_in
         goals, goal_note = self.goals(slots, self.buildings, self.options)
         walls, passages = split_walls(slots, roads, self.buildings)
         self.left_out["buildings over slots or lanes, which are no walls"] += passages
@@ -364,7 +359,7 @@ class _LotImport(MapImport):
         index = np.flatnonzero(is_free)
         return [self.slots[i] for i in index.tolist()], slots[index]
 
-    def _edge(self, slots: Slots) -> shapely.Geometry:
+    def edge(self, slots: Slots) -> shapely.Geometry:
         if self.box is not None:
             return shapely.Polygon(shapely.box(*self.box))
         low, high = slots.xy.min(axis=0) - STREETS_AROUND, slots.xy.max(axis=0) + STREETS_AROUND

@@ -194,14 +194,13 @@ def kerb_of(
     return Kerb(orientation, capacity, where in ("lane", "on_street"))
 
 
-def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float, float]]) -> Slots:
+def kerb_slots(road: Road, side: Side, kerb: Kerb, free: Sequence[tuple[float, float]]) -> Slots:
     """Create the slots along one side of a road, in the order of its points, on the free intervals.
 
     As many as tagged, at most as fit at 5 m, or else as fit at 6 m (2.5 m across the street). A tagged `width` includes
     cars parked on the carriageway.
     """
     how = ARRANGEMENTS[kerb.orientation]
-    free = free_intervals(float(np.hypot(*np.diff(road.points, axis=0).T).sum()), closed)
     parallel = how.angle == 0.0
     least = SHORTEST_KERB_SLOT if parallel and kerb.capacity is not None else how.pitch
     depth = how.width if parallel else how.length * float(np.sin(how.angle))
@@ -224,18 +223,6 @@ def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float,
         anchors = row_anchors(road.points, middle + ranks * step, fitted.pitch, side)
         rows.append(row_at(anchors, offset, fitted, with_points=road.oneway or side == road.near_side))
     return Slots.joined(rows)
-
-
-def free_intervals(total: float, closed: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return what is left of the length of a road between closed intervals, start and end in m from its start."""
-    free, start = [], 0.0
-    for begin, end in sorted(closed):
-        if min(begin, total) - start > ROUNDING:
-            free.append((start, min(begin, total)))
-        start = max(start, end)
-    if total - start > ROUNDING:
-        free.append((start, total))
-    return free
 
 
 def _distribute(capacity: int, free: Sequence[tuple[float, float]], fit: IntArray) -> IntArray:
@@ -265,14 +252,17 @@ class Junctions:
                         away = road.points[j] - road.points[i]
                         self._arms[at].append((k, away / np.hypot(*away)))
 
-    def closed_intervals(self, k: int, side: Side) -> list[tuple[float, float]]:
-        """Return the intervals without parking on a side of road k, start and end in m from its start.
+    def free_intervals(
+        self, k: int, side: Side, closed: Iterable[tuple[float, float]] = ()
+    ) -> list[tuple[float, float]]:
+        """Return the intervals for parking on a side of road k, start and end in m from its start, but for closed ones.
 
-        At streets, both sides are free for 5 m beyond the corner and its parked cars; at service roads, their side.
+        At streets, both sides are kept clear for 5 m beyond the corner and its parked cars; at service roads, their
+        side.
         """
-        points = self._roads[k].points
-        stations = np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))].tolist()
-        closed = []
+        points, closed = self._roads[k].points, list(closed)
+        steps = np.hypot(*np.diff(points, axis=0).T)
+        stations = np.r_[0.0, np.cumsum(steps)].tolist()
         for i, station in enumerate(stations):
             at = int(self._label[self._first[k] + i])
             clearances = [CORNER_CLEARANCE] if at in self._crossings else []
@@ -280,7 +270,12 @@ class Junctions:
                 tangent = points[min(i + 1, len(points) - 1)] - points[max(i - 1, 0)]
                 clearances += self._clearances(k, at, tangent / np.hypot(*tangent), side)
             closed += [(station - clearance, station + clearance) for clearance in clearances]
-        return closed
+        free, start, total = [], 0.0, float(steps.sum())
+        for begin, end in (*sorted(closed), (total, total)):
+            if min(begin, total) - start > ROUNDING:
+                free.append((start, min(begin, total)))
+            start = max(start, end)
+        return free
 
     def _clearances(self, k: int, at: int, tangent: FloatArray, side: Side) -> Iterator[float]:
         for other, away in self._arms[at]:

@@ -320,7 +320,11 @@ def lanes_of(roads: Sequence[Road]) -> list[Lane]:
     return [Lane(road.points, road.oneway) for road in roads]
 
 
-def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
+def clipped_roads(roads: Sequence[Road], box: shapely.Geometry) -> list[Road]:
+    return [part for road in roads for part in _clipped(road, box)]
+
+
+def _clipped(road: Road, box: shapely.Geometry) -> list[Road]:
     line = shapely.LineString(road.points)
     if shapely.covers(box, line):
         return [road]

@@ -129,14 +129,12 @@ def import_town(
             town = _around_bays(name, place, register, bounds, left_hand, whole=not bays_only)
         else:
             town = _TownImport(name, place if bounds is None else place.within(bounds), left_hand)
-        if not bays_only:
-            town.read_drawn()
+        town.read_drawn()
         if register is not None:
             town.use_bays(register if bounds is None else register.within(bounds))
         else:
             town.read_kerbs(untagged_kerbs)
-        if not bays_only:
-            town.read_counted()
+        town.read_counted()
         if listed:
             town.use_list(listed)
         if listed_only:
@@ -234,13 +232,12 @@ class _TownImport(MapImport):
 
     def read_kerbs(self, untagged: float) -> None:
         strips = {
-            k: area
+            k: supply.strip_side(area, self.roads, self.tree)
             for k, area in enumerate(self.parking)
-            if area.element.tags.get("parking") in supply.STRIPS
+            if k not in self.used
         }
-        drawn = {k: supply.strip_side(strips[k], self.roads, self.tree) for k in strips if k not in self.used}
-        self.used |= {k for k, side in drawn.items() if side is not None}
-        sides = list(filter(None, drawn.values()))
+        self.used |= {k for k, side in strips.items() if side is not None}
+        sides = list(filter(None, strips.values()))
         sides += supply.kerb_sides(self.roads, self.crossings(), self.buildings, self.left_out, untagged)
         # Several runs of one way are one kerb.
         whole: dict[str, supply.FacilityRow] = {}
@@ -253,19 +250,16 @@ class _TownImport(MapImport):
                 row.slots = Slots.joined([row.slots, side.slots])
         rows = list(whole.values())
         slots = Slots.joined([row.slots for row in rows] or [NO_SLOTS])
-        of = np.repeat(np.arange(len(rows)), [len(row.slots) for row in rows])
         others = Slots.joined([*(row.slots for row in self.rows), NO_SLOTS])
         boxes = np.concatenate([others.boxes(MAPPED_OVERLAP), slots.boxes(RULE_OVERLAP)])
         is_free = without_overlaps(boxes)[len(others) :] & is_clear(slots, corridors_of(self.roads), 0.05)
-        lost = np.bincount(of[~is_free], minlength=len(rows))
-        self.left_out["kerbs with fewer places, because of streets and other places"] += [
-            rows[k].element for k in np.flatnonzero(lost).tolist()
-        ]
-        slots, of = slots[np.flatnonzero(is_free)], of[is_free]
-        for row, start, end in zip(
-            rows, *np.searchsorted(of, [range(len(rows)), range(1, len(rows) + 1)]), strict=True
-        ):
-            row.slots = slots[start:end]
+        end = np.cumsum([len(row.slots) for row in rows], dtype=np.int64)
+        for row, free in zip(rows, np.split(is_free, end), strict=False):
+            if not free.all():
+                self.left_out["kerbs with fewer places, because of streets and other places"].append(
+                    row.element
+                )
+            row.slots = row.slots[free]
             row.slot_rules = [row.rules] * len(row.slots)
         self.rows += [row for row in rows if len(row.slots)]
 

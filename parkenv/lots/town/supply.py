@@ -11,7 +11,7 @@ along the nearest street.
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -54,7 +54,6 @@ from parkenv.lots.osm.parking import (
     Area,
     Junctions,
     Kerb,
-    free_intervals,
     kerb_of,
     kerb_slots,
 )
@@ -355,16 +354,8 @@ def facilities_of(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
     if len(row.slots) and row.name in filled:
         yield Facility(row.name, row.kind, row.rules.zone(row.kind).name)
     for name, capacity, rules in row.counted if row.xy is not None else ():
-        yield Facility(
-            name,
-            row.kind,
-            rules.zone(row.kind).name,
-            capacity,
-            row.xy,
-            usual.gate_s,
-            usual.inside_s,
-            usual.known,
-        )
+        zone = rules.zone(row.kind).name
+        yield Facility(name, row.kind, zone, capacity, row.xy, usual.gate_s, usual.inside_s, usual.known)
 
 
 def table_of(rows: Sequence[FacilityRow], draft: LotDraft) -> list[dict[str, Any]]:
@@ -478,13 +469,12 @@ def kerb_sides(
     rest: dict[str, float] = defaultdict(float)  # fractions of places, by class, so that totals are kept
     for k, road in enumerate(roads):
         kind = road.tags["highway"]
-        total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
         for side in sorted(SIDES, key=road.near_side.__eq__):
             tagged = road.side_of_way(side)
             by_tag = any(
                 f"{key}:{at}" in road.tags for key in ("parking", "parking:lane") for at in (tagged, "both")
             )
-            closed = everything.closed_intervals(k, side)
+            free = everything.free_intervals(k, side)
             source, rule, capacity = "rule", CLASS_RULE, None
             if by_tag:
                 kerb = kerb_of(road, side, left_out, reserved=True)
@@ -492,8 +482,7 @@ def kerb_sides(
                     continue
                 capacity, source, rule = kerb.capacity, "tag", ""
                 if capacity is None:
-                    free = sum(end - start for start, end in free_intervals(total, closed))
-                    kerb = replace(kerb, capacity=int(free / METRES_PER_PLACE[kerb.orientation]))
+                    kerb = replace(kerb, capacity=int(_metres(free) / METRES_PER_PLACE[kerb.orientation]))
                     source, rule = "rule", "length of kerb"
             else:
                 if (
@@ -502,29 +491,28 @@ def kerb_sides(
                     or (side != road.near_side and _is_half(road))
                 ):
                     continue
-                closed = closed + lonely[k]
-                off_corners = corners.closed_intervals(street[k], side) + lonely[k]
-                free = sum(end - start for start, end in free_intervals(total, off_corners))
-                free *= untagged * (2 if _is_half(road) else 1)
-                expected = PLACES_PER_METRE.get(kind, 0.0) * free + rest[kind]
+                free = everything.free_intervals(k, side, lonely[k])
+                metres = _metres(corners.free_intervals(street[k], side, lonely[k]))
+                metres *= untagged * (2 if _is_half(road) else 1)
+                expected = PLACES_PER_METRE.get(kind, 0.0) * metres + rest[kind]
                 rest[kind] = expected % 1.0
                 kerb = Kerb("parallel", int(expected), False)
-            slots = kerb_slots(road, side, kerb, closed)
+            slots = kerb_slots(road, side, kerb, free)
             if len(slots):
                 rules, name = kerb_rules(road.tags, tagged), road.tags.get("name", "")
                 yield FacilityRow(name, "kerb", rules, source, rule, f"{road.id} {tagged}", capacity, slots)
 
 
 def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> FacilityRow | None:
-    """Return the kerb that is drawn as an area, under its name; None if it is not along a road of the tree."""
+    """Return the kerb that is drawn as an area, under its name; None if it is none along a road of the tree."""
     tags = area.element.tags
-    (index, distance) = tree.query_nearest(area.polygon, return_distance=True, all_matches=False)
-    if not len(index) or distance[0] > STRIP_REACH:
+    index, distance = tree.query_nearest(area.polygon, return_distance=True, all_matches=False)
+    if tags.get("parking") not in STRIPS or not len(index) or distance[0] > STRIP_REACH:
         return None
     road = roads[int(index[0])]
     line = linestrings([road.points])[0]
     stations = shapely.line_locate_point(line, shapely.points(shapely.get_coordinates(area.polygon)))
-    start, end, total = float(stations.min()), float(stations.max()), float(shapely.length(line))
+    start, end = float(stations.min()), float(stations.max())
     if end - start < SHORTEST_KERB_SLOT:
         return None
     orientation = tags.get("orientation", tags.get("parking:orientation", "parallel"))
@@ -537,12 +525,16 @@ def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> Faci
     )
     along, away = ahead - here, middle - here
     side: Side = "left" if along[0] * away[1] - along[1] * away[0] > 0.0 else "right"
-    slots = kerb_slots(road, side, Kerb(orientation, capacity, False), [(-1.0, start), (end, total + 1.0)])
+    slots = kerb_slots(road, side, Kerb(orientation, capacity, False), [(start, end)])
     if not len(slots):
         return None
     source, rule = ("tag", "") if tagged is not None else ("rule", "length of kerb")
     name = tags.get("name", road.tags.get("name", ""))
     return FacilityRow(name, "kerb", rules_of(tags), source, rule, area.element.id, tagged, slots)
+
+
+def _metres(intervals: Iterable[tuple[float, float]]) -> float:
+    return sum(end - start for start, end in intervals)
 
 
 def _is_half(road: Road) -> bool:
