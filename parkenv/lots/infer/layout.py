@@ -10,7 +10,7 @@
 Roads of the map are lanes as they are: rows that they reach need no aisle.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +18,7 @@ import shapely
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
-from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, QualityIssue
+from parkenv.lots.draft import ImportOptions, LeftOut, QualityIssue
 from parkenv.lots.generators import Slots, nearest_on_lanes
 from parkenv.lots.infer import network
 from parkenv.lots.infer.aisles import Aisle, OpenRow, View, find_aisles, least_aisle, open_rows
@@ -168,48 +168,17 @@ SHARE_UNSURE = 0.35  # certainty below which the open side of a row counts as a 
 TWO_WAY_WIDTH = 4.5  # least width, m, of a two-way aisle
 
 
-def draft_inferred_lot(
-    name: str,
-    lot: InferredLot,
-    spaces: Spaces,
-    options: ImportOptions,
-    *,
-    source: str,
-    left_out: Mapping[str, Sequence[str]],
-    frame: LocalFrame,
-    goals: FloatArray,
-    goal_note: str,
-) -> LotDraft:
-    """Draft an inferred lot; `source` is that of its slots, `left_out` are other spaces of the file."""
-    without_aisle = {reason: [spaces.ids[i] for i in members] for reason, members in lot.left_out.items()}
-    lost = sum(map(len, without_aisle.values()))
+def spaces_without_aisle(lot: InferredLot, spaces: Spaces) -> dict[str, list[str]]:
+    """Return the ids of spaces without an aisle, by reason; too many are an error."""
+    named = {reason: [spaces.ids[i] for i in members] for reason, members in lot.left_out.items()}
+    lost = sum(map(len, named.values()))
     if lost > MOST_LOST * len(spaces):
-        reasons = "; ".join(map(str, LeftOut.by_reason(without_aisle)))
+        reasons = "; ".join(map(str, LeftOut.by_reason(named)))
         raise InputError(f"{lost} of {len(spaces)} spaces have no aisle: {reasons}")
-    if not len(goals) and options.guess_goal:
-        goals, goal_note = lot.goal, "on the side of the entry"
-    is_known = bool(options.entries) or options.guess_entry or lot.entry is None
-    entries = lot.entries if is_known else lot.entries[:0]
-    unused = sum(map(len, left_out.values()))
-    guesses, issues = _guesses_and_issues(lot, len(spaces), unused, options, goal_note)
-    return LotDraft(
-        name=name,
-        slot_ids=tuple(spaces.ids[i] for i in lot.index),
-        slots=lot.slots,
-        slot_source=(source,) * len(lot.index),
-        lanes=lot.lanes,
-        entries=entries,
-        goals=goals,
-        found=tuple(_found(lot, len(spaces), frame)),
-        guesses=tuple(guesses),
-        issues=tuple(issues),
-        left_out=LeftOut.by_reason({**left_out, **without_aisle}),
-        missing=tuple(_missing(lot, entries, goals)),
-        frame=frame,
-    ).searchable()
+    return named
 
 
-def _found(lot: InferredLot, n: int, frame: LocalFrame) -> Iterator[str]:
+def findings(lot: InferredLot, n: int, frame: LocalFrame) -> Iterator[str]:
     rows = lot.rows
     slants = np.digitize(np.degrees([part.row.slant for part in rows]), (15.0, 75.0)).tolist()
     kinds = enumerate(("kerbside", "oblique", "perpendicular"))
@@ -221,7 +190,7 @@ def _found(lot: InferredLot, n: int, frame: LocalFrame) -> Iterator[str]:
     yield f"frame: {frame}"
 
 
-def _guesses_and_issues(
+def guesses_and_issues(
     lot: InferredLot, n: int, unused: int, options: ImportOptions, goal_note: str
 ) -> tuple[list[str], list[QualityIssue]]:
     """Return a sentence for each guess, and what may be wrong; `unused` spaces beside the n were not inferred from."""
@@ -273,7 +242,7 @@ def _guesses_and_issues(
     )
 
 
-def _missing(lot: InferredLot, entries: FloatArray, goals: FloatArray) -> Iterator[str]:
+def missing_parts(lot: InferredLot, entries: FloatArray, goals: FloatArray) -> Iterator[str]:
     if not len(entries):
         x, y = lot.entries[0].tolist()
         yield (

@@ -32,7 +32,13 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, naming, require
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
 from parkenv.lots.generators import NO_SLOTS, Slots
-from parkenv.lots.infer.layout import draft_inferred_lot, infer_lot
+from parkenv.lots.infer.layout import (
+    findings,
+    guesses_and_issues,
+    infer_lot,
+    missing_parts,
+    spaces_without_aisle,
+)
 from parkenv.lots.infer.network import STREET, Line, limit_junctions
 from parkenv.lots.infer.spaces import rectangle_corners, spaces_from_outlines, to_rectangle, validate_areas
 from parkenv.lots.local_frame import LocalFrame
@@ -465,23 +471,31 @@ def outline_draft(of: MapImport, roads: Sequence[Road], options: ImportOptions) 
     obstacles = [a.polygon for a in (*buildings, *unused)]
     lines = [Line(road.points, road.oneway, STREET if road.rank is Rank.STREET else -1) for road in roads]
     lot = infer_lot(spaces, obstacles, lines, points_in_frame(of.frame, options.entries))
+    n_unused = sum(map(len, of.left_out.values()))
+    of.left_out.update(spaces_without_aisle(lot, spaces))
     goals, goal_note = of.goals(lot.slots, buildings, options)
-    draft = draft_inferred_lot(
-        of.name,
-        lot,
-        spaces,
-        options,
-        source=MAPPED,
-        left_out=of.left_out,
-        frame=of.frame,
+    if not len(goals) and options.guess_goal:
+        goals, goal_note = lot.goal, "on the side of the entry"
+    is_known = bool(options.entries) or options.guess_entry or lot.entry is None
+    entries = lot.entries if is_known else lot.entries[:0]
+    guesses, issues = guesses_and_issues(lot, len(spaces), n_unused, options, goal_note)
+    return LotDraft(
+        name=of.name,
+        slot_ids=tuple(spaces.ids[i] for i in lot.index),
+        slots=lot.slots,
+        slot_source=(MAPPED,) * len(lot.index),
+        lanes=lot.lanes,
+        entries=entries,
         goals=goals,
-        goal_note=goal_note,
-    )
-    return replace(
-        draft,
         walls=tuple(exterior_rings(a.polygon for a in buildings)),
         outlines=tuple(exterior_rings(a.polygon for a in parking)),
-    )
+        found=tuple(findings(lot, len(spaces), of.frame)),
+        guesses=tuple(guesses),
+        issues=tuple(issues),
+        left_out=LeftOut.by_reason(of.left_out),
+        missing=tuple(missing_parts(lot, entries, goals)),
+        frame=of.frame,
+    ).searchable()
 
 
 def _refuse_swapped(areas: Sequence[Area]) -> None:

@@ -182,12 +182,14 @@ class _TownImport(MapImport):
             self.left_out[f"parking with {reason}"].append(element.id)
         return reason is None
 
-    def _named(self, tags: Any, element_id: str) -> str:
-        name = str(tags.get("name", ""))
+    def _named(self, name: str, element_id: str) -> str:
         name = name if name and is_plain(name) else element_id
         name = f"{name} ({element_id})" if name in self.names else name
         self.names.add(name)
         return name
+
+    def _named_kerb(self, street: str, element_id: str) -> str:
+        return self._named(f"{street} ({element_id})" if street else "", element_id)
 
     def read_drawn(self) -> None:
         """Read the spaces that are drawn one by one, grouped by the car park around them, else by their distance."""
@@ -216,7 +218,7 @@ class _TownImport(MapImport):
             inside = around.element
             whole = supply.rules_of(inside.tags) if k in self.used else supply.Rules()
             row = supply.FacilityRow(
-                self._named(inside.tags, inside.id), "lot", whole, "drawn", "", inside.id
+                self._named(inside.tags.get("name", ""), inside.id), "lot", whole, "drawn", "", inside.id
             )
             row.slots = slots[owner[index] == k]
             # A space without rules of its own has those of its car park.
@@ -244,8 +246,7 @@ class _TownImport(MapImport):
         for side in sides:
             row = whole.setdefault(side.element, side)
             if row is side:
-                named = f"{side.name} ({side.element})" if is_plain(side.name) and side.name else ""
-                row.name = self._named({"name": named}, side.element)
+                row.name = self._named_kerb(side.name, side.element)
             else:
                 row.slots = Slots.joined([row.slots, side.slots])
         rows = list(whole.values())
@@ -285,7 +286,7 @@ class _TownImport(MapImport):
             rows[f"{roads[k].id} {side}", roads[k].tags.get("name", "")].append(i)
         for (element, street), index in rows.items():
             own_rules = [rules[own] for own in register.rules[kerbs.bay[index]].tolist()]
-            name = self._named({"name": f"{street} ({element})" if street else ""}, element)
+            name = self._named_kerb(street, element)
             usual = Counter(own_rules).most_common(1)[0][0]
             slots, ids = kerbs.slots[np.array(index)], [kerbs.ids[i] for i in index]
             row = supply.FacilityRow(
@@ -325,7 +326,7 @@ class _TownImport(MapImport):
             tagged = count_in(tags, "capacity", "by area and levels")
             source = ("tag", "") if tagged else ("rule", rule)
             row = supply.FacilityRow(
-                self._named(tags, element.id), kind, rules, *source, element.id, tagged, xy=xy
+                self._named(tags.get("name", ""), element.id), kind, rules, *source, element.id, tagged, xy=xy
             )
             places = tagged or supply.expected_capacity(rule, area, supply.levels_of(tags))
             row.counted = supply.counted_parts(row.name, places, rules, tags)
@@ -352,7 +353,7 @@ class _TownImport(MapImport):
             # It is counted as a whole, open to everybody, and cars stand there when it is closed, too.
             capacity = car_park.capacity or int(places[k])
             self.names.discard(row.name)
-            row.name = self._named({"name": car_park.name}, row.element)
+            row.name = self._named(car_park.name, row.element)
             row.slots, row.slot_rules = NO_SLOTS, []
             paid = {} if row.rules.per_hour else PAID
             row.rules = replace(row.rules, users=PUBLIC, hours="", **paid)
