@@ -95,6 +95,7 @@ from parkenv.world.lot import Lane
 
 # Values of `parking` for slots that are not in the open at ground level.
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
+PARKING = ("parking", "parking_space")  # values of `amenity`
 FARTHEST = 100_000.0  # largest distance of parking and roads from the centre of a map, m
 BLIND = {("noexit", "yes"), ("highway", "turning_circle"), ("highway", "turning_loop")}  # tags of dead ends
 STREETS_AROUND = 60.0  # distance beyond the slots, m, within which streets are lanes if no bounds are given
@@ -125,11 +126,18 @@ def draft_of_map(
     Lanes are inferred from outlines of spaces where there are no roads, or, if guesses are allowed, too few of them.
     """
     elements = place.elements
-    has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
+    parking = [e for e in elements if _is_parking(e)]
+    require(
+        parking,
+        "no parking in it: no amenity=parking_space, no amenity=parking, no street with "
+        "parking:left, parking:right or parking:both",
+    )
+    has_spaces = any(e.tags.get("amenity") == "parking_space" for e in parking)
     ways = (e for e in elements if not e.is_node)
     if has_spaces and not any(isinstance(road_of(e.id, e.tags, e.lines[0] * 1e5), Road) for e in ways):
-        return outline_draft(MapImport(name, place, frame or map_frame(elements)), [], options)
-    importer = _LotImport(name, place, options, frame)
+        return outline_draft(MapImport(name, place, frame or frame_around(parking)), [], options)
+    refuse_far_away([e for e in elements if _is_parking(e) or "highway" in e.tags])
+    importer = _LotImport(name, place, frame or frame_around(parking), options)
     importer.read_spaces()
     importer.fill_outlines()
     importer.line_kerbs()
@@ -141,10 +149,9 @@ def draft_of_map(
     return draft
 
 
-def map_frame(elements: Sequence[OsmElement]) -> LocalFrame:
-    parking = [e for e in elements if _is_parking(e)]
-    refuse_far_away(parking)
-    return LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
+def frame_around(elements: Sequence[OsmElement]) -> LocalFrame:
+    refuse_far_away(elements)
+    return LocalFrame.around(np.concatenate([line for e in elements for line in e.lines]))
 
 
 class _Part(NamedTuple):
@@ -208,15 +215,8 @@ class _Slot(NamedTuple):
 
 
 class _LotImport(MapImport):
-    def __init__(self, name: str, place: OsmMap, options: ImportOptions, frame: LocalFrame | None) -> None:
-        parking = [e for e in place.elements if _is_parking(e)]
-        require(
-            parking,
-            "no parking in it: no amenity=parking_space, no amenity=parking, no street with "
-            "parking:left, parking:right or parking:both",
-        )
-        refuse_far_away([e for e in place.elements if _is_parking(e) or "highway" in e.tags])
-        super().__init__(name, place, frame or map_frame(place.elements))
+    def __init__(self, name: str, place: OsmMap, frame: LocalFrame, options: ImportOptions) -> None:
+        super().__init__(name, place, frame)
         self.options, self.box = options, options.box(self.frame)
         self.notes: list[str] = []
         self.roads = read_roads(place.elements, self.frame, self.left_out, left_hand=options.left_hand)
@@ -225,9 +225,9 @@ class _LotImport(MapImport):
         self.outlines, self.spaces, self.buildings = (
             within(self.areas(wanted), self.box) for wanted in (is_parking_area, is_space, is_building)
         )
-        for e in parking:
+        for e in place.elements:
             kind = e.tags.get("amenity", "")
-            if kind.startswith("parking") and not (e.lines and e.is_closed):
+            if kind in PARKING and not (e.lines and e.is_closed):
                 self.left_out[f"amenity={kind} without an outline"].append(e.id)
         self.slots: list[_Slot] = []
         self.parts: list[Slots] = []  # of the same slots
@@ -392,9 +392,9 @@ class _LotImport(MapImport):
             )
 
     def _found(self, draft: LotDraft, roads: Sequence[Road], goal_note: str) -> Iterable[str]:
+        kept = set(draft.slot_ids)
         for source in (MAPPED, FILLED, KERBSIDE):
-            owner_of = {slot.id: slot.owner for slot in self.slots if slot.source == source}
-            owners = [owner_of[name] for name in draft.slot_ids if name in owner_of]
+            owners = [slot.owner for slot in self.slots if slot.source == source and slot.id in kept]
             if owners:
                 yield f"slots from {source}: {len(owners)} (elements: {len(set(owners))})"
         aisles, service = (sum(road.rank is rank for road in roads) for rank in (Rank.AISLE, Rank.SERVICE))
@@ -413,7 +413,7 @@ class _LotImport(MapImport):
 
 def _is_parking(element: OsmElement) -> bool:
     tags = element.tags
-    return tags.get("amenity") in ("parking", "parking_space") or (
+    return tags.get("amenity") in PARKING or (
         "highway" in tags and any(key.startswith(("parking:", "parking:lane:")) for key in tags)
     )
 
@@ -560,7 +560,7 @@ def split_town(
     require(spaces, "no amenity=parking_space in it, want their outlines to find car parks")
     if len(spaces) > MOST_IN_TOWN:
         raise InputError(f"{len(spaces):,} parking spaces, want at most {MOST_IN_TOWN:,} in one file")
-    frame = map_frame(spaces)
+    frame = frame_around(spaces)
     shapes = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in spaces], dtype=object)
     near = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=SAME_CAR_PARK)
     label = component_labels(near.T, len(spaces))

@@ -358,9 +358,7 @@ def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) 
         for road, xy, is_first in road_ends(roads)
         if road.rank is Rank.STREET and (is_first or not road.oneway)
     ]
-    if not ends:
-        return np.empty((0, 2))
-    xy = np.array(ends)
+    xy = np.array(ends).reshape(-1, 2)
     at_edge = shapely.dwithin(shapely.get_exterior_ring(edge), np.asarray(shapely.points(xy)), 0.1)
     if at_edge.any():
         return xy[np.flatnonzero(at_edge)]

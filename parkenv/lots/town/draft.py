@@ -41,7 +41,7 @@ from parkenv.lots.osm.draft import (
     RULE_OVERLAP,
     SAME_CAR_PARK,
     MapImport,
-    refuse_far_away,
+    frame_around,
 )
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.parking import (
@@ -152,9 +152,7 @@ class _TownImport(MapImport):
         elements, merged = _with_nodes_in_areas(elements)
         streets = [e for e in elements if "highway" in e.tags and not e.is_node]
         require(streets, "no street in it, want ways with the tag highway")
-        refuse_far_away(streets)
-        frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
-        super().__init__(name, replace(place, elements=elements), frame)
+        super().__init__(name, replace(place, elements=elements), frame_around(streets))
         self.streets = read_streets(elements, self.frame, self.left_out, left_hand=left_hand)
         self.left_out["car parks mapped as a point, too, within their outlines"] += merged
         self.roads = self.streets.roads_of(self.streets.kept)
