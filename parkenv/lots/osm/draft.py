@@ -45,7 +45,6 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.conditions import RESERVED_PLACES, note_other_keys
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.parking import (
-    ARRANGEMENTS,
     BUILDING_REACH,
     ENTRANCE_REACH,
     Area,
@@ -62,10 +61,11 @@ from parkenv.lots.osm.parking import (
     is_space,
     kerb_of,
     kerb_slots,
+    orientation_of,
     slots_by_rank,
     split_space,
     split_walls,
-    usable_spaces,
+    why_no_slot,
     within,
     without_overlaps,
 )
@@ -176,6 +176,20 @@ class MapImport:
             ]
         return [a for a in areas if shapely.area(a.polygon) > 0.0]
 
+    def usable(
+        self, areas: Iterable[Area], why_not: Callable[[Area], str | None]
+    ) -> tuple[list[Area], list[Area]]:
+        """Divide areas into those that are used and the others, which are listed with why they are not."""
+        judged = [(area, why_not(area)) for area in areas]
+        others = [(area, reason) for area, reason in judged if reason is not None]
+        for area, reason in others:
+            self.left_out[reason].append(area.element.id)
+        return [area for area, reason in judged if reason is None], [area for area, _ in others]
+
+    def usable_spaces(self, spaces: Sequence[Area], parking: Sequence[Area]) -> tuple[list[Area], list[Area]]:
+        private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
+        return self.usable(spaces, lambda space: why_no_slot(space, private))
+
     def crossings(self) -> FloatArray:
         return self.points(lambda e: e.tags.get("highway") == "crossing")
 
@@ -222,7 +236,7 @@ class _LotImport(MapImport):
         self.roads = read_roads(place.elements, self.frame, self.left_out, left_hand=options.left_hand)
         if self.box is not None:
             self.roads = clipped_roads(self.roads, shapely.box(*self.box))
-        self.outlines, self.spaces, self.buildings = (
+        self.parking, self.spaces, self.buildings = (
             within(self.areas(wanted), self.box) for wanted in (is_parking_area, is_space, is_building)
         )
         for e in place.elements:
@@ -234,16 +248,20 @@ class _LotImport(MapImport):
         self.rows: Counter[str] = Counter()  # number of slots so far of each row
         self.blocked: list[shapely.Geometry] = [a.polygon for a in self.buildings]
 
-    def _add_row(self, source: str, owner: str, start: str, slots: Slots, rank: Rank) -> None:
+    def _add_row(
+        self, source: str, owner: str, start: str, slots: Slots, rank: Rank, tagged: int | None, where: str
+    ) -> None:
         first = self.rows[start] + 1
         self.rows[start] += len(slots)
         self.slots += [_Slot(source, owner, f"{start}-{first + k}", rank) for k in range(len(slots))]
         self.parts.append(slots)
+        if tagged is not None and len(slots) < tagged:
+            self.notes.append(f"{owner}: {len(slots)} of the tagged {tagged} slots fit {where}")
 
     # ---- slots ----
 
     def read_spaces(self) -> None:
-        usable, unused = usable_spaces(self.spaces, self.outlines, self.left_out)
+        usable, unused = self.usable_spaces(self.spaces, self.parking)
         self.blocked += [area.polygon for area in (*unused, *usable)]
         spaces, index, ranks, slots = self.drawn_slots(usable, lanes_of(self.roads), self.roads)
         drawn = zip([spaces[i] for i in index.tolist()], ranks, strict=True)
@@ -253,7 +271,7 @@ class _LotImport(MapImport):
     def fill_outlines(self) -> None:
         centers = shapely.points(np.concatenate([np.empty((0, 2)), *(slots.xy for slots in self.parts)]))
         tree = shapely.STRtree([shapely.LineString(road.points) for road in self.roads])
-        for area in self.outlines:
+        for area in self.parking:
             tags, name = area.element.tags, area.element.id
             kind = tags.get("parking", "surface")
             reason = closed_to_cars(tags) or off_the_ground(tags)
@@ -265,7 +283,6 @@ class _LotImport(MapImport):
             note_other_keys(tags)
             if shapely.contains(area.polygon, centers).any():
                 continue
-            orientation = tags.get("orientation", tags.get("parking:orientation"))
             capacity = count_in(tags, "capacity", "as many as fit")
             if capacity is not None:
                 parts = (whole_number(tags.get(f"capacity:{users}")) or 0 for users in RESERVED_PLACES)
@@ -278,7 +295,7 @@ class _LotImport(MapImport):
                     area.polygon,
                     [self.roads[k] for k in near if self.roads[k].rank <= rank],
                     [self.blocked[k] for k in on_it],
-                    orientation if orientation in ARRANGEMENTS else None,
+                    orientation_of(tags),
                     capacity,
                 )
                 if len(slots):
@@ -286,10 +303,8 @@ class _LotImport(MapImport):
             if not len(slots):
                 self.left_out["parking areas without a road along which a slot fits"].append(name)
                 continue
-            self._add_row(FILLED, name, name, slots, rank)
+            self._add_row(FILLED, name, name, slots, rank, capacity, "by the rule")
             self.blocked += list(slots.boxes(shrink=0.02))
-            if capacity is not None and len(slots) < capacity:
-                self.notes.append(f"{name}: {len(slots)} of the tagged {capacity} slots fit by the rule")
 
     def line_kerbs(self) -> None:
         if not any(road.has_kerb_parking for road in self.roads):
@@ -301,14 +316,11 @@ class _LotImport(MapImport):
                 kerb = kerb_of(road, side, self.left_out)
                 if kerb is None:
                     continue
-                tagged = road.side_of_way(side)
                 slots = kerb_slots(road, side, kerb, junctions.free_intervals(k, side))
                 slots = slots[is_clear(slots, corridors, 0.05)]
-                self._add_row(KERBSIDE, road.id, f"{road.id}-{tagged}", slots, road.rank)
-                if kerb.capacity is not None and len(slots) < kerb.capacity:
-                    self.notes.append(
-                        f"{road.id}: {len(slots)} of the tagged {kerb.capacity} slots fit on the {tagged}"
-                    )
+                tagged = road.side_of_way(side)
+                start, where = f"{road.id}-{tagged}", f"on the {tagged}"
+                self._add_row(KERBSIDE, road.id, start, slots, road.rank, kerb.capacity, where)
 
     # ---- the lot ----
 
@@ -344,7 +356,7 @@ class _LotImport(MapImport):
             entries=entries,
             goals=goals,
             walls=tuple(walls),
-            outlines=tuple(exterior_rings(a.polygon for a in self.outlines)),
+            outlines=tuple(exterior_rings(a.polygon for a in self.parking)),
             missing=tuple(self._missing(slots, roads, entries, goals)),
             frame=self.frame,
             turns=turns.kept,
@@ -463,7 +475,7 @@ def outline_draft(of: MapImport, roads: Sequence[Road], options: ImportOptions) 
         [a.element.id for a in areas], shapely.area(np.array([a.polygon for a in areas], dtype=object))
     )
     buildings, parking = (of.areas(wanted, mended=True) for wanted in (is_building, is_parking_area))
-    kept, unused = usable_spaces(areas, parking, of.left_out)
+    kept, unused = of.usable_spaces(areas, parking)
     if not kept:
         raise InputError(f"no parking space for cars: {'; '.join(map(str, LeftOut.by_reason(of.left_out)))}")
     ids, polygons = zip(*(part for a in kept for part in split_space(a.element, a.polygon, [])), strict=True)

@@ -64,6 +64,12 @@ ARRANGEMENTS = {
 DRAWN = 0.05  # tolerance, m, of the length of a row: OpenStreetMap's seven digits round to a centimetre
 
 
+def orientation_of(tags: Mapping[str, str]) -> str | None:
+    """Return the key of `ARRANGEMENTS` that an area is tagged with, or None."""
+    name = tags.get("orientation", tags.get("parking:orientation"))
+    return name if name in ARRANGEMENTS else None
+
+
 class RowAnchors(NamedTuple):
     """Anchors of a row's slots: n points on the road's centre line."""
 
@@ -177,9 +183,9 @@ def kerb_of(
         return None
     users, minutes = kerb_users(tags, side)
     if users == FORBIDDEN or not minutes.any() or (users != PUBLIC and not reserved):
-        new = {"restriction=": "parking:{}:restriction", "access=": "parking:{}:access"}
-        old_keys = {"": "parking:condition:{}", " ": "parking:lane:{}"}
-        by_name = new if kind is not None else old_keys
+        by_name = {"restriction=": "parking:{}:restriction", "access=": "parking:{}:access"}
+        if kind is None:
+            by_name = {"": "parking:condition:{}", " ": "parking:lane:{}"}
         reasons = ((name, tags.get(kerb_tag(tags, text, side), "")) for name, text in by_name.items())
         closed = (
             f"{name.strip()}{value}" for name, value in reasons if users_of(value) not in (PUBLIC, None)
@@ -518,21 +524,7 @@ def is_parking_area(element: OsmElement) -> bool:
     return element.tags.get("amenity") == "parking"
 
 
-def usable_spaces(
-    spaces: Sequence[Area], parking: Sequence[Area], left_out: Mapping[str, list[str]]
-) -> tuple[list[Area], list[Area]]:
-    """Return the spaces that are slots, and the others, which are listed."""
-    private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
-    usable, others = list[Area](), list[Area]()
-    for space in spaces:
-        reason = _why_no_slot(space, private)
-        (others if reason else usable).append(space)
-        if reason:
-            left_out[reason].append(space.element.id)
-    return usable, others
-
-
-def _why_no_slot(space: Area, private: Sequence[shapely.Geometry]) -> str | None:
+def why_no_slot(space: Area, private: Sequence[shapely.Geometry]) -> str | None:
     tags, kind = space.element.tags, space.element.tags.get("parking_space", "normal")
     disabled = tags.get("capacity:disabled", "no") not in ("no", "0")
     closed = closed_to_cars(tags) or off_the_ground(tags)

@@ -159,7 +159,7 @@ class _TownImport(MapImport):
         self.lines = linestrings([road.points for road in self.roads])
         self.tree = shapely.STRtree(self.lines)
         self.buildings = self.areas(is_building, mended=True)
-        self.parking = [a for a in self.areas(is_parking_area, mended=True) if self._is_open(a.element)]
+        self.parking, _ = self.usable(self.areas(is_parking_area, mended=True), _why_closed)
         for e in elements:
             if is_parking_area(e) and not e.is_node and not e.is_closed:
                 self.left_out["parking without an outline"].append(e.id)
@@ -173,13 +173,6 @@ class _TownImport(MapImport):
         self.bays_found: tuple[str, ...] = ()
         self.listed: list[str] = []  # which facilities car parks of a list are
 
-    def _is_open(self, element: OsmElement) -> bool:
-        kind = element.tags.get("parking")
-        reason = f"parking={kind}" if kind in UNUSED else closed_parking(element.tags)
-        if reason is not None:
-            self.left_out[f"parking with {reason}"].append(element.id)
-        return reason is None
-
     def _named(self, name: str, element_id: str) -> str:
         name = name if name and is_plain(name) else element_id
         name = f"{name} ({element_id})" if name in self.names else name
@@ -191,18 +184,7 @@ class _TownImport(MapImport):
 
     def read_drawn(self) -> None:
         """Read the spaces that are drawn one by one, grouped by the car park around them, else by their distance."""
-        spaces = []
-        for area in self.areas(is_space, mended=True):
-            tags, kind = area.element.tags, area.element.tags.get("parking_space", "normal")
-            reason = off_the_ground(tags) or closed_parking(tags)
-            if kind not in CAR_SPACES and supply.rules_of(tags).users == PUBLIC:
-                reason = f"parking_space={kind}"
-            if area.element.cut:
-                reason = "an outline that the edge of the map cuts"
-            if reason is None:
-                spaces.append(area)
-            else:
-                self.left_out[f"spaces with {reason}"].append(area.element.id)
+        spaces, _ = self.usable(self.areas(is_space, mended=True), _why_no_space)
         lanes = lanes_of([road for road in self.roads if road.rank < Rank.STREET])
         parts, index, _, slots = self.drawn_slots(spaces, lanes, self.roads)
         if not parts:
@@ -299,25 +281,21 @@ class _TownImport(MapImport):
             if e.tags.get("amenity") == "parking_entrance" and closed_parking(e.tags) is None
         ]
         entrances = [self.frame.to_xy(e.lines[0])[0] for e in ways_in]
-        points = [
-            (e, shapely.Point(self.frame.to_xy(e.lines[0])[0]), None)
+        points = (
+            Area(e, shapely.Point(self.frame.to_xy(e.lines[0])[0]))
             for e in (*self.nodes, *_unseen_garages(self.parking, ways_in, entrances))
-            if is_parking_area(e) and self._is_open(e)
-        ]
-        outlines = [
-            (a.element, a.polygon, float(shapely.area(a.polygon)))
-            for k, a in enumerate(self.parking)
-            if k not in self.used
-        ]
-        for element, shape, area in (*outlines, *points):
-            tags = element.tags
+            if is_parking_area(e)
+        )
+        outlines = (a for k, a in enumerate(self.parking) if k not in self.used)
+        for area in (*outlines, *self.usable(points, _why_closed)[0]):
+            element, tags = area.element, area.element.tags
             rule = supply.rule_of(tags)
             kind = supply.RULES[rule].kind
             rules = supply.rules_of(tags)
             note_other_keys(tags)
             if rule == "boxes" and rules.users == PUBLIC:
                 rules = replace(rules, users="private")
-            xy = self._entrance(shape, entrances if FACILITY_KINDS[kind].gate_s else [])
+            xy = self._entrance(area.polygon, entrances if FACILITY_KINDS[kind].gate_s else [])
             if xy is None:
                 self.left_out[TOO_FAR].append(element.id)
                 continue
@@ -326,7 +304,8 @@ class _TownImport(MapImport):
             row = supply.FacilityRow(
                 self._named(tags.get("name", ""), element.id), kind, rules, *source, element.id, tagged, xy=xy
             )
-            places = tagged or supply.expected_capacity(rule, area, supply.levels_of(tags))
+            size = float(shapely.area(area.polygon)) or None  # a point has none
+            places = tagged or supply.expected_capacity(rule, size, supply.levels_of(tags))
             row.counted = supply.counted_parts(row.name, places, rules, tags)
             self.rows.append(row)
 
@@ -417,18 +396,30 @@ class _TownImport(MapImport):
             turns=turns.kept,
         ).searchable()
         rows = supply.table_of(self.rows, draft)
-        left_out = (
-            *self.place.left_out,
-            *LeftOut.by_reason(self.left_out),
-            *turns.left_out,
-            *draft.left_out,
-        )
+        listed = LeftOut.by_reason(self.left_out)
+        left_out = (*self.place.left_out, *listed, *turns.left_out, *draft.left_out)
         found = (*_findings(self, rows, draft, along), *turns.found, *self.place.cut_elements())
         guessed = (ALONG_STREETS,) * along + ("entries where the streets reach farthest",) * is_guess
         guesses = (*_guesses(rows, draft), *guessed)
         lost = (left for left in left_out if self.n_bays and left.reason in (NO_AISLE, UNREACHED))
         draft = replace(draft, found=found, left_out=left_out, guesses=guesses)
         return TownDraft(draft, rows, (*self.bays_left_out, *lost))
+
+
+def _why_closed(area: Area) -> str | None:
+    kind = area.element.tags.get("parking")
+    reason = f"parking={kind}" if kind in UNUSED else closed_parking(area.element.tags)
+    return reason and f"parking with {reason}"
+
+
+def _why_no_space(area: Area) -> str | None:
+    tags, kind = area.element.tags, area.element.tags.get("parking_space", "normal")
+    reason = off_the_ground(tags) or closed_parking(tags)
+    if kind not in CAR_SPACES and supply.rules_of(tags).users == PUBLIC:
+        reason = f"parking_space={kind}"
+    if area.element.cut:
+        reason = "an outline that the edge of the map cuts"
+    return reason and f"spaces with {reason}"
 
 
 def _has_kerbs(road: Road) -> bool:

@@ -49,13 +49,13 @@ from parkenv.lots.osm.conditions import (
     week_of,
 )
 from parkenv.lots.osm.parking import (
-    ARRANGEMENTS,
     SHORTEST_KERB_SLOT,
     Area,
     Junctions,
     Kerb,
     kerb_of,
     kerb_slots,
+    orientation_of,
 )
 from parkenv.lots.osm.roads import SIDES, Rank, Road, Side, count_in
 from parkenv.lots.unread import note_unread
@@ -515,8 +515,7 @@ def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> Faci
     start, end = float(stations.min()), float(stations.max())
     if end - start < SHORTEST_KERB_SLOT:
         return None
-    orientation = tags.get("orientation", tags.get("parking:orientation", "parallel"))
-    orientation = orientation if orientation in ARRANGEMENTS else "parallel"
+    orientation = orientation_of(tags) or "parallel"
     tagged = count_in(tags, "capacity", "by the length of the kerb")
     capacity = tagged if tagged is not None else max(round((end - start) / METRES_PER_PLACE[orientation]), 1)
     middle = shapely.get_coordinates(shapely.centroid(area.polygon))[0]
