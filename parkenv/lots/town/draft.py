@@ -312,10 +312,8 @@ class _TownImport(MapImport):
     def use_list(self, listed: list[supply.ListedCarPark]) -> None:
         """Give the car parks of a list their names and capacities; those that the map lacks are garages of it."""
         of_map = [row for row in self.rows if row.kind != "kerb" and row.xy is not None]
-        places = np.array([len(row.slots) + sum(n for _, n, _ in row.counted) for row in of_map], np.float64)
         at = self.frame.to_xy([(car_park.lon, car_park.lat) for car_park in listed])
-        xy = np.array([row.xy for row in of_map]).reshape(-1, 2)
-        same = supply.matched(listed, at, [row.name for row in of_map], places, xy)
+        same = supply.matched(listed, at, of_map)
         for car_park, point, k in zip(listed, at, same.tolist(), strict=True):
             if k < 0:
                 xy_of = self._entrance(shapely.Point(point), [])
@@ -326,9 +324,9 @@ class _TownImport(MapImport):
                 self.rows.append(row)
             else:
                 row = of_map[k]
-                self.listed.append(f"{car_park.name}: {row.name}, {places[k]:.0f} places in the map")
+                self.listed.append(f"{car_park.name}: {row.name}, {row.places} places in the map")
             # It is counted as a whole, open to everybody, and cars stand there when it is closed, too.
-            capacity = car_park.capacity or int(places[k])
+            capacity = car_park.capacity or row.places
             self.names.discard(row.name)
             row.name = self._named(car_park.name, row.element)
             row.slots, row.slot_rules = NO_SLOTS, []

@@ -314,6 +314,10 @@ class FacilityRow:
     )  # name, places, rules of counted parts
     xy: tuple[float, float] | None = None
 
+    @property
+    def places(self) -> int:
+        return len(self.slots) + sum(n for _, n, _ in self.counted)
+
 
 def counted_parts(
     name: str, places: int, rules: Rules, tags: Mapping[str, str]
@@ -359,19 +363,15 @@ def facilities_of(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
 
 
 def table_of(rows: Sequence[FacilityRow], draft: LotDraft) -> list[dict[str, Any]]:
-    names, count = np.unique(draft.slots.facility, return_counts=True)
-    slots = dict(zip(names.tolist(), count.tolist(), strict=True))
+    slots = Counter(draft.slots.facility.tolist())
     counted = {facility.name: facility.capacity for facility in draft.facilities}
     table = []
     for row in rows:
-        places = slots.get(row.name, 0) + sum(counted.get(name, 0) for name, _, _ in row.counted)
+        places = slots[row.name] + sum(counted.get(name, 0) for name, _, _ in row.counted)
         if places:
-            more = {
-                "capacity": places,
-                "zone": row.rules.zone(row.kind).name,
-                "slots": slots.get(row.name, 0),
-            }
-            table.append({name: more[name] if name in more else getattr(row, name) for name in TABLE})
+            zone = row.rules.zone(row.kind).name
+            cells = {**vars(row), "capacity": places, "zone": zone, "slots": slots[row.name]}
+            table.append({name: cells[name] for name in TABLE})
     return table
 
 
@@ -404,9 +404,7 @@ def read_listed(path: Path) -> list[ListedCarPark]:
     return list(listed.values())
 
 
-def matched(
-    listed: list[ListedCarPark], at: FloatArray, names: list[str], capacity: FloatArray, xy: FloatArray
-) -> IntArray:
+def matched(listed: Sequence[ListedCarPark], at: FloatArray, rows: Sequence[FacilityRow]) -> IntArray:
     """Return which facility each car park of a list, at (k, 2) m, is: index or -1, each at most once; nearest in all.
 
     It is within `NEAR` and of like capacity, or shares a rare word with the name within `SAME_NAME` times as far.
@@ -414,9 +412,9 @@ def matched(
     words = [_words(car_park.name) for car_park in listed]
     use = Counter(word for each in words for word in each)
     rare = [{word for word in each if use[word] <= max(len(listed) // 4, 1)} for each in words]
-    shared = np.array([[bool(each & _words(name)) for name in names] for each in rare])
-    ratio = np.array([[max(car_park.capacity, 1)] for car_park in listed]) / np.maximum(capacity, 1.0)
-    away = np.hypot(*(at[:, None] - xy).transpose(2, 0, 1))
+    shared = np.array([[bool(each & _words(row.name)) for row in rows] for each in rare])
+    ratio = np.array([[max(car_park.capacity, 1)] for car_park in listed]) / [max(r.places, 1) for r in rows]
+    away = np.hypot(*(at[:, None] - np.array([row.xy for row in rows]).reshape(-1, 2)).transpose(2, 0, 1))
     away = np.where(shared, away / SAME_NAME, away)
     stated = np.array([[car_park.capacity > 0] for car_park in listed])
     unlike = ~shared & stated & (np.maximum(ratio, 1.0 / ratio) > _SIMILAR)
