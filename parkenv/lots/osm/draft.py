@@ -17,6 +17,9 @@ Entries are the points where service roads meet a public street or, if streets a
 map: at its edge, or otherwise at ends not tagged as dead ends. Goals are the building entrances (`entrance`) near the
 slots, main entrances first, or the centre of the nearest building. Buildings block the view. Traffic keeps to the
 right, unless `in_left_hand_traffic` converts the draft.
+
+`MapImport` is what lots and towns (`parkenv.lots.town.draft`) read alike: areas, spaces, points, and what is left out.
+A lot is slots beside whole roads, those that fit; a town is facilities with rules and capacities at pieces of streets.
 """
 
 from collections import Counter, defaultdict
@@ -138,9 +141,9 @@ def draft_of_map(
         return outline_draft(MapImport(name, place, frame or frame_around(parking)), [], options)
     refuse_far_away([e for e in elements if _is_parking(e) or "highway" in e.tags])
     importer = _LotImport(name, place, frame or frame_around(parking), options)
-    importer.read_spaces()
-    importer.fill_outlines()
-    importer.line_kerbs()
+    importer.read_drawn()
+    importer.fill_areas()
+    importer.read_kerbs()
     draft = importer.draft()
     incomplete = bool(draft.missing) or any(left.reason == NO_AISLE for left in draft.left_out)
     if has_spaces and incomplete and (options.guess_entry or options.guess_goal):
@@ -260,7 +263,7 @@ class _LotImport(MapImport):
 
     # ---- slots ----
 
-    def read_spaces(self) -> None:
+    def read_drawn(self) -> None:
         usable, unused = self.usable_spaces(self.spaces, self.parking)
         self.blocked += [area.polygon for area in (*unused, *usable)]
         spaces, index, ranks, slots = self.drawn_slots(usable, lanes_of(self.roads), self.roads)
@@ -268,7 +271,7 @@ class _LotImport(MapImport):
         self.slots += [_Slot(MAPPED, space.area.element.id, space.name, rank) for space, rank in drawn]
         self.parts.append(slots)
 
-    def fill_outlines(self) -> None:
+    def fill_areas(self) -> None:
         centers = shapely.points(np.concatenate([np.empty((0, 2)), *(slots.xy for slots in self.parts)]))
         tree = shapely.STRtree([shapely.LineString(road.points) for road in self.roads])
         for area in self.parking:
@@ -306,7 +309,7 @@ class _LotImport(MapImport):
             self._add_row(FILLED, name, name, slots, rank, capacity, "by the rule")
             self.blocked += list(slots.boxes(shrink=0.02))
 
-    def line_kerbs(self) -> None:
+    def read_kerbs(self) -> None:
         if not any(road.has_kerb_parking for road in self.roads):
             return
         junctions = Junctions(self.roads, self.crossings())
