@@ -67,7 +67,6 @@ class CodeFiles:
         self._folder = cache_folder() / f"{function.__module__}-{source_key(function.__code__.co_filename)}"
 
     def _path(self, types: tuple[Any, ...]) -> Path:
-        """Return the file for types of arguments and the processor of this machine."""
         processor = cpu_target.target_context.codegen().magic_tuple()
         digest = hashlib.sha256(self._key + f"{types} {processor}".encode())
         return self._folder / f"{self._name}-{digest.hexdigest()[:16]}.nbc"

@@ -235,8 +235,6 @@ def _late_machine_code() -> Iterator[None]:
         codegen._library_class, codegen.set_env = library_class, set_env
 
 
-# For functions that make no arrays, nor call one that does. Numba's counting of references to all arrays that they are
-# given would take most of their time, and most of the time of compiling.
+# For functions that make no arrays: counting references to those that they are given would take most of their time.
 kernel = compiled(error_model="numpy", _nrt=False)
-# For parts of a loop: passing all arrays on at each call would take a third of its time.
 inlined = compiled(error_model="numpy", _nrt=False, forceinline=True)

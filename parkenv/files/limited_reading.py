@@ -198,13 +198,11 @@ class _PlainTree(ElementTree.TreeBuilder):
         raise InputError(f"declares the document type {name!r:.40}, want none: entities are not read")
 
 
-def read_xml(path: str | Path, root: str) -> ElementTree.Element:
+def read_xml(path: str | Path, root: str, most: int = MAX_BYTES // 4) -> ElementTree.Element:
     """Return the root, of this name without namespace, of XML without document type; trees take 20 times as much."""
     with naming(path):
         try:
-            tree = ElementTree.fromstring(
-                read_bytes(path, MAX_BYTES // 4), ElementTree.XMLParser(target=_PlainTree())
-            )
+            tree = ElementTree.fromstring(read_bytes(path, most), ElementTree.XMLParser(target=_PlainTree()))
         except ElementTree.ParseError as error:
             raise InputError(f"not XML: {error}") from error
         if tree.tag.rpartition("}")[2] != root:

@@ -43,8 +43,10 @@ from parkenv.forecast.count_table import DAY_S, FINE, HOURS, Capacity, Readings,
 
 _TOLERANCE = 0.05  # of the capacity
 _SURPRISE = math.log(1e9)
-_WINDOW = 28  # days
-_IDLE = 0.02  # of the places, smallest change of occupancy of a car park in use
+_WINDOW, _IDLE = (
+    28,
+    0.02,
+)  # days; share of the places that are taken and left at least where a car park is in use
 _REPEATS_PRIOR = (2.0, 4.0)  # repeats of readings, and pairs, assumed before any is seen
 
 

@@ -21,9 +21,7 @@ BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)  # bands of fullness
 
 Band = dict[str, float | int | None]  # A band of fullness: from, to, days, coverage_90
 
-_WEEK = 7  # days
-_BINS = 20  # of the forecast, whose reliability is shown
-_REPETITIONS = 1_000  # of a bootstrap
+_WEEK, _BINS, _REPETITIONS = 7, 20, 1_000  # days; of the forecast, for its reliability; of a bootstrap
 
 
 def log_losses(forecast: DayForecast, occupied: FloatArray, capacity: FloatArray) -> FloatArray:
