@@ -198,7 +198,7 @@ def test_belief_gains_from_cues_in_a_nearly_full_lot():
     for cues in (None, Cues(20.0), Cues(20.0, 0.5, 0.02)):
         scenario = busy(cues, p=0.995, stay_s=1800.0)
         env, agent = gym.make("parkenv/Search-v2", scenario=scenario), make_agent("belief", scenario)
-        done = [parkenv.simulate(env, agent, seed=seed) for seed in range(100)]
+        done = [parkenv.simulate(env, agent, seed=seed) for seed in range(60)]
         totals[cues] = np.array([search.info["total_s"] for search in done])
     none, perfect, sensed = totals.values()
     assert (perfect - none).mean() < -20.0
