@@ -57,7 +57,6 @@ class OnboardPerception:
         self._view_starts, self._view_slots = scenario.slots_in_view
         self._rates = scenario.sensor_rates
         self._cues = None if scenario.cues is None else DepartureCues(scenario.lot)
-        self._has_live_counts = len(scenario.live_slots) > 0
         self._kept_s = scenario.cues.lead_s if scenario.cues else 0.0
         self.reset()
 
@@ -77,7 +76,7 @@ class OnboardPerception:
         rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
         self.observation = SlotObservation(observed.slots[used], observed.taken[used])
         apply_observations_at(address, *self.observation, rates.hit[rated], rates.false_alarm[rated])
-        if self._has_live_counts:
+        if self.scenario.live_slots.size:
             observe_live_at(address)
         if self._cues is not None and self.results:
             self._update_cues(address, self._cues, (*before, *self.results)[-2:])

@@ -206,8 +206,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     every lot.
 
     ## Keys
-    For `gymnasium.utils.play.play(env, wait_on_player=True, noop=4)` (needs the extra `human`): w, s, a, d drive up,
-    down, left, right; space parks.
+    With `gymnasium.utils.play.play(env, wait_on_player=True, noop=4)` (extra `human`): w, s, a, d drive; space parks.
 
     ## Arguments
     - `scenario`: a name, such as `campus`, a scenario file (.toml), a lot (.geojson; with days as in busy
@@ -354,7 +353,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         number = action_number(action)
         # A wrapper's time limit may end the episode at any step, so every step has the metrics.
         reward, over, vertex, info = read_step(self._scenario_index, self._step(self._address, number))
-        raise_error()
+        if self.searches.needs_python:
+            raise_error()
         path = self._state.path
         if vertex != path[-1]:
             path.append(vertex)
